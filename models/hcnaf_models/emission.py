@@ -1,0 +1,100 @@
+"""From the hyper-network's raw numbers to theta, ready to multiply.
+
+    raw [..., P - D] --exp on diagonal blocks--> weight normalisation --units--> theta [..., P]
+
+Units: the flow works on u = (x - m) / s with a location m and a scale s per dimension, both emitted. m leads
+theta, s is folded into the first layer (W / s), so theta takes x in natural units and gives densities per
+natural unit, with no other code having to know.
+"""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+
+import torch
+from torch import Tensor, nn
+
+from hcnaf_models.flow import Layer, layers
+from hcnaf_models.spec import FlowSpec, lower_pairs
+
+
+class Emission(nn.Module):
+    """raw, location, scale -> theta.
+
+    Args:
+        spec: the flow's sizes and weight normalisation. `row` and `frobenius` learn one log-gain per output
+            row or per layer, independent of the condition, initialised log U(0, 1).
+    """
+
+    def __init__(self, spec: FlowSpec) -> None:
+        super().__init__()
+        self.spec = spec
+        self.log_gains = nn.ParameterList()
+        for k in range(1, spec.layers + 2) if spec.weight_norm != "none" else ():
+            shape = (spec.dims, spec.fan_out(k)) if spec.weight_norm == "row" else ()
+            self.log_gains.append(nn.Parameter(torch.log(torch.rand(shape).clamp(min=1e-3))))
+
+    def forward(self, raw: Tensor, location: Tensor, scale: Tensor) -> Tensor:
+        """theta [..., P] from raw [..., P - D] and location, scale [..., D] in natural units (scale > 0)."""
+        out = [location]
+        for k, layer in enumerate(layers(self.spec, torch.split(raw, list(self.spec.groups[1:]), dim=-1))):
+            layer = self._normalise(k, layer._replace(diagonal=torch.exp(layer.diagonal)))
+            if k == 0:
+                layer = self._to_natural_units(layer, scale)
+            out += [v.reshape(*raw.shape[:-1], -1) for v in layer]
+        return torch.cat(out, dim=-1)
+
+    def _normalise(self, k: int, layer: Layer) -> Layer:
+        if self.spec.weight_norm == "none":
+            return layer
+        squares = self._row_squares(layer)  # [..., D, H_out]
+        if self.spec.weight_norm == "frobenius":
+            squares = squares.sum((-1, -2), keepdim=True).expand_as(squares)
+        gain = torch.exp(self.log_gains[k]) * torch.rsqrt(squares + 1e-24)
+        rows = list(lower_pairs(self.spec.dims)[0])
+        return Layer(layer.diagonal * gain.unsqueeze(-1), layer.lower * gain[..., rows, :, None], layer.bias)
+
+    def _row_squares(self, layer: Layer) -> Tensor:
+        """Sum of squares of every output row, off-diagonal blocks included: [..., D, H_out]."""
+        own, lower = layer.diagonal.square().sum(-1), layer.lower.square().sum(-1)
+        starts = [d * (d - 1) // 2 for d in range(self.spec.dims + 1)]
+        parts = [lower[..., a:b, :].sum(-2) for a, b in pairwise(starts)]
+        return own + torch.stack(parts, dim=-2)
+
+    def _to_natural_units(self, layer: Layer, scale: Tensor) -> Layer:
+        """W u = (W / s) (x - m)."""
+        columns = list(lower_pairs(self.spec.dims)[1])
+        return layer._replace(
+            diagonal=layer.diagonal / scale[..., None, None],
+            lower=layer.lower / scale[..., columns, None, None],
+        )
+
+
+def initial_raw(spec: FlowSpec, generator: torch.Generator | None = None) -> Tensor:
+    """A standard initialisation of raw [P - D]: the bias of zero-weight heads.
+
+    First-layer units tile u in [-3, 3] with slopes around 1.5, inner rows sum to about 2, last rows to about 4,
+    so that the flow starts as a smooth map of u onto most of the base's range; coupling blocks start near zero.
+    """
+    H, D = spec.hidden, spec.dims
+    out: list[Tensor] = []
+    for k in range(1, spec.layers + 2):
+        rows, cols = spec.fan_out(k), spec.fan_in(k)
+        jitter = 0.3 * torch.randn(D, rows, cols, generator=generator)
+        if k == 1:
+            slope = jitter + math.log(1.5)
+            bias = -torch.exp(slope.squeeze(-1)) * _spaced(H, 3.0)
+        elif k <= spec.layers:
+            slope = jitter + math.log(2.0 / H)
+            bias = _spaced(H, 1.5).expand(D, H)
+        else:
+            slope, bias = jitter + math.log(4.0 / H), torch.zeros(D, 1)
+        lower = 0.1 / math.sqrt(cols) * torch.randn(spec.pairs, rows, cols, generator=generator)
+        out += [slope.flatten(), lower.flatten(), bias.flatten()]
+    return torch.cat(out)
+
+
+def _spaced(count: int, bound: float) -> Tensor:
+    """`count` numbers evenly over [-bound, bound]; a single one is 0."""
+    return torch.linspace(-bound, bound, count) if count > 1 else torch.zeros(1)

@@ -1,0 +1,72 @@
+"""Hyper-network heads, and the MLP hyper-network for vector conditions."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from hcnaf_models.config import ConditionConfig
+from hcnaf_models.emission import Emission, initial_raw
+from hcnaf_models.spec import FlowSpec
+
+LOCATION_BOUND = 6.0
+LOG_SCALE_BOUND = 5.0
+
+
+class Head(nn.Module):
+    """features [..., R] -> theta [..., P].
+
+    Weights start at zero and the bias at a standard initialisation, so that theta starts independent of the
+    condition (Beck et al. 2023; Chang et al. 2020). The emitted location and scale are bounded: m within
+    6 base scales of the anchor, s within a factor e^5 of the base scale.
+    """
+
+    def __init__(self, spec: FlowSpec, features: int) -> None:
+        super().__init__()
+        self.spec = spec
+        self.emission = Emission(spec)
+        self.weights = nn.Linear(features, spec.weights)
+        self.units = nn.Linear(features, 2 * spec.dims)
+        nn.init.zeros_(self.weights.weight)
+        nn.init.zeros_(self.units.weight)
+        nn.init.zeros_(self.units.bias)
+        with torch.no_grad():
+            self.weights.bias.copy_(initial_raw(spec))
+
+    def forward(self, features: Tensor, anchor: Tensor, spread: Tensor) -> Tensor:
+        """theta, with the location `anchor` [..., D] and scale `spread` [..., D] (natural units) to start from."""
+        shift, log_scale = self.units(features).chunk(2, dim=-1)
+        location = anchor + spread * bounded(shift, LOCATION_BOUND)
+        scale = spread * torch.exp(bounded(log_scale, LOG_SCALE_BOUND))
+        theta: Tensor = self.emission(self.weights(features), location, scale)
+        return theta
+
+
+def bounded(v: Tensor, bound: float) -> Tensor:
+    """A smooth clamp to (-bound, bound), the identity near 0."""
+    return bound * torch.tanh(v / bound)
+
+
+class ConditionHyperNet(nn.Module):
+    """condition [A, K] -> theta [A, 1, P]."""
+
+    def __init__(self, config: ConditionConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.body = mlp(config.size, config.hidden)
+        self.head = Head(config.flow, config.hidden[-1])
+
+    def forward(self, condition: Tensor) -> Tensor:
+        features = self.body(condition).unsqueeze(-2)
+        flat = torch.zeros_like(features[..., :1]).expand(*features.shape[:-1], self.config.flow.dims)
+        theta: Tensor = self.head(features, flat + self.config.location, flat + self.config.scale)
+        return theta
+
+
+def mlp(features: int, widths: tuple[int, ...]) -> nn.Sequential:
+    """Linear and ReLU for each width."""
+    layers: list[nn.Module] = []
+    for width in widths:
+        layers += [nn.Linear(features, width), nn.ReLU()]
+        features = width
+    return nn.Sequential(*layers)
