@@ -1,0 +1,1 @@
+"""The training side of HCNAF: data, training, evaluation, ONNX graphs, export and parity (PyTorch)."""
