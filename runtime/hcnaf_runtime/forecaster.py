@@ -1,0 +1,177 @@
+"""The forecaster: scenes in, densities and occupancy maps out. The one class most users meet."""
+
+import os
+import time
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from hcnaf_runtime import cells, frames
+from hcnaf_runtime.bundle import Bundle
+from hcnaf_runtime.encoder import Encoder, Horizons, Theta
+from hcnaf_runtime.errors import GridError, InputError
+from hcnaf_runtime.flow import Flow
+from hcnaf_runtime.grid import Grid
+from hcnaf_runtime.maps import Maps, Timings
+from hcnaf_runtime.scene import Condition, Scene
+from hcnaf_runtime.session import default_threads
+
+Float32 = npt.NDArray[np.float32]
+Float64 = npt.NDArray[np.float64]
+Frame = Literal["agent", "scene"]
+
+DEFAULT_GRID = Grid(200, 200, 0.5)
+TOLERANCE = 1e-6
+"""Cells are refined until they change by less; ten times below what a map is promised to be accurate to."""
+
+_MOST_BYTES = 4 << 30
+_STRIP = 1 << 20  # fine cells of a scene-frame map that are held at once
+
+
+class Forecaster:
+    """Forecasts with one bundle. Thread-safe; frees what it takes when it is dropped.
+
+    `bundle` is an open Bundle, a directory, or None for the embedded model. `threads` is how many CPUs a
+    graph may use (None: those usable by this process, at most 4).
+    """
+
+    def __init__(self, bundle: Bundle | str | os.PathLike[str] | None = None, threads: int | None = None) -> None:
+        if threads is not None and threads < 1:
+            raise InputError(f"threads is {threads}, expected at least 1")
+        self.bundle = bundle if isinstance(bundle, Bundle) else Bundle.open(bundle)
+        self.threads = threads or default_threads()
+        self.flow = Flow(self.bundle, self.threads)
+        self._encoder = Encoder(self.bundle, self.threads)
+
+    def theta(self, scene: Scene | Condition, horizons: Horizons = None) -> Theta:
+        """The flow's weights. The hyper-network runs once per scene and horizons; the last are remembered.
+
+        `horizons` (s) default to every whole second in the trained range, and are absent for a Condition.
+        Raises SceneError where the scene does not fit the bundle and HorizonError outside the trained range.
+        """
+        return self._encoder.theta(scene, horizons)[0]
+
+    def log_prob(
+        self,
+        scene: Scene | Condition,
+        points: npt.NDArray[Any],
+        horizons: Horizons = None,
+        frame: Frame = "agent",
+    ) -> Float32:
+        """Log-density [A, T, N] of each agent's box centre at `points` (nats per m²).
+
+        `points` is [N, D], [A, N, D] or [A, T, N, D] (m), in each agent's own frame or in the scene frame.
+        The two differ by a rigid motion, so the density is the same number in both. Raises SceneError,
+        HorizonError, or InputError for points of another shape or not finite.
+        """
+        _check_frame(frame, scene)
+        theta = self.theta(scene, horizons)
+        A, T, P = theta.values.shape
+        places = _points(points, A, T, self.flow.dims)
+        if frame == "scene":
+            places = np.stack([frames.to_agent(p, pose) for p, pose in zip(places, theta.pose, strict=True)])
+        D, N = places.shape[-1], places.shape[-2]
+        flat = np.ascontiguousarray(places.reshape(A * T, N, D), dtype=np.float32)
+        return self.flow.log_prob(theta.values.reshape(A * T, P), flat).reshape(A, T, N)
+
+    def pom(
+        self,
+        scene: Scene | Condition,
+        grid: Grid | None = None,
+        horizons: Horizons = None,
+        frame: Frame = "agent",
+        tolerance: float = TOLERANCE,
+    ) -> Maps:
+        """Occupancy maps: the probability of every cell, from the flow's distribution functions.
+
+        In the agent's frame (x forward, y left, origin at the box centre) cells are exact up to `tolerance`.
+        In the scene frame the map is computed in the agent's frame with half the cell size, over the box that
+        covers the grid, and each fine cell's mass is moved to the scene cell that holds its centre: mass is
+        conserved, and displaced by less than half a cell.
+
+        `grid` defaults to 200x200@0.5. One without an origin reaches a quarter of its width behind the agent
+        (agent frame), or lies about the middle of the forecast agents (scene frame) or about 0 (a Condition).
+        Raises SceneError, HorizonError or GridError.
+        """
+        _check_frame(frame, scene)
+        theta, seconds = self._encoder.theta(scene, horizons)
+        start = time.perf_counter()
+        placed = _place(grid or DEFAULT_GRID, scene, frame, theta)
+        fill = self._agent_maps if frame == "agent" else self._scene_maps
+        mass, error = fill(theta, placed, tolerance)
+        return Maps(
+            mass=mass,
+            horizons=theta.horizons,
+            agents=theta.agents,
+            pose=theta.pose,
+            origin=placed.corners[0],
+            resolution=placed.resolution,
+            frame=frame,
+            window_mass=mass.sum(axis=(2, 3), dtype=np.float64),
+            quadrature_error=error,
+            notes=theta.notes,
+            timings=Timings(seconds, time.perf_counter() - start),
+        )
+
+    def _agent_maps(self, theta: Theta, grid: Grid, tolerance: float) -> tuple[Float32, Float64]:
+        A, T, P = theta.values.shape
+        window = cells.Window(grid.x_edges, grid.y_edges)
+        mass, error = cells.masses(self.flow, theta.values.reshape(A * T, P), window, tolerance)
+        return mass.reshape(A, T, grid.height, grid.width), error.reshape(A, T)
+
+    def _scene_maps(self, theta: Theta, grid: Grid, tolerance: float) -> tuple[Float32, Float64]:
+        A, T, _ = theta.values.shape
+        mass = np.zeros((A, T, grid.height, grid.width), np.float32)
+        error = np.zeros((A, T))
+        for a, pose in enumerate(theta.pose):
+            for strip in frames.covering(grid, pose, grid.resolution / 2).strips(_STRIP):
+                for t in range(T):
+                    fine, found = cells.masses(self.flow, theta.values[a, t : t + 1], strip, tolerance)
+                    frames.deposit(fine[0], strip, pose, grid, mass[a, t])
+                    error[a, t] = max(error[a, t], found[0])
+        return mass, error
+
+
+def _check_frame(frame: str, scene: Scene | Condition) -> None:
+    if frame not in ("agent", "scene"):
+        raise InputError(f"frame is '{frame}', expected 'agent' or 'scene'")
+    if frame == "scene" and isinstance(scene, Condition):
+        raise InputError("frame is 'scene', a condition has none; use 'agent'")
+
+
+def _points(points: npt.NDArray[Any], A: int, T: int, D: int) -> npt.NDArray[Any]:
+    """`points` as [A, T, N, D]."""
+    found = np.asarray(points)
+    if found.ndim == 3:
+        found = found[:, None]
+    try:
+        if found.ndim not in (2, 4) or found.shape[-1] != D or found.dtype.kind not in "fiu":
+            raise ValueError
+        result = np.broadcast_to(found, (A, T, found.shape[-2], D))
+    except ValueError:
+        raise InputError(
+            f"points is {np.asarray(points).dtype} {list(np.shape(points))}, expected float "
+            f"[N, {D}], [{A}, N, {D}] or [{A}, {T}, N, {D}]"
+        ) from None
+    if not np.isfinite(found).all():
+        raise InputError("points hold NaN or infinity, expected finite numbers (m)")
+    return result
+
+
+def _place(grid: Grid, scene: Scene | Condition, frame: str, theta: Theta) -> Grid:
+    """The grid with an origin, once it is known that the maps fit in memory."""
+    A, T, _ = theta.values.shape
+    size = 4 * A * T * grid.width * grid.height
+    if size > _MOST_BYTES:
+        raise GridError(
+            f"maps of {size >> 20} MiB asked for, at most {_MOST_BYTES >> 20}; ask for fewer or coarser"
+        )
+    if grid.origin is not None:
+        return grid
+    if isinstance(scene, Condition):
+        return grid.around(0.0, 0.0)
+    if frame == "agent":
+        return grid.ahead()
+    low, high = theta.pose[:, :2].min(axis=0), theta.pose[:, :2].max(axis=0)
+    return grid.around(*((low + high) / 2).tolist())

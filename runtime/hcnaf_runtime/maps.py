@@ -1,0 +1,71 @@
+"""Occupancy maps: what a forecast gives back."""
+
+import os
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from hcnaf_runtime.npz import write_npz
+
+Float32 = npt.NDArray[np.float32]
+Float64 = npt.NDArray[np.float64]
+
+SAVED = (
+    "mass",
+    "horizons",
+    "agents",
+    "pose",
+    "origin",
+    "resolution",
+    "frame",
+    "window_mass",
+    "quadrature_error",
+)
+"""The fields of forecast.npz."""
+
+
+@dataclass(frozen=True)
+class Timings:
+    """Seconds spent in the hyper-network (0 if theta was known already) and in everything after it."""
+
+    hypernet: float
+    maps: float
+
+
+@dataclass(frozen=True, eq=False)
+class Maps:
+    """The probability that each agent's box centre is in each cell, at each horizon."""
+
+    mass: Float32
+    """[A, T, rows, cols]: row 0 is the lowest y, column 0 the lowest x."""
+    horizons: Float32
+    """[T]: time ahead (s); a single 0 for a bundle without time."""
+    agents: npt.NDArray[np.int64]
+    """[A]: index of each agent in the scene."""
+    pose: Float64
+    """[A, 3]: x, y (m) and yaw (rad) of each agent now, in the scene frame."""
+    origin: Float64
+    """[2]: x, y of the grid's lower-left corner (m), in `frame`."""
+    resolution: float
+    """Size of a cell (m)."""
+    frame: str
+    """"agent": each map is in its agent's frame (x forward, y left, from the box centre); or "scene"."""
+    window_mass: Float64
+    """[A, T]: the probability inside the grid."""
+    quadrature_error: Float64
+    """[A, T]: the largest change of a cell in the last refinement."""
+    notes: tuple[str, ...]
+    """What was assumed, such as an absent optional raster channel."""
+    timings: Timings
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the fields SAVED as an .npz file; either all of it appears or nothing does."""
+        write_npz(path, {name: getattr(self, name) for name in SAVED})
+
+    def peak(self, agent: int, horizon: int) -> tuple[float, float, float]:
+        """x, y (m, in `frame`) of the most probable cell's centre and its mass; by position in A and T."""
+        mass = self.mass[agent, horizon]
+        row, column = np.unravel_index(int(mass.argmax()), mass.shape)
+        x, y = self.origin + (np.array([column, row]) + 0.5) * self.resolution
+        return float(x), float(y), float(mass[row, column])

@@ -1,0 +1,87 @@
+"""One graph of a bundle, loaded into onnxruntime with every setting made on purpose."""
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy.typing as npt
+
+from hcnaf_runtime import manifest
+from hcnaf_runtime.errors import BundleError, InputError
+
+Array = npt.NDArray[Any]
+
+MOST_THREADS = 4
+"""More threads than this do not pay for graphs of this size."""
+
+
+def default_threads() -> int:
+    """The CPUs this process may use, at most MOST_THREADS."""
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return min(usable, MOST_THREADS)
+
+
+class Session:
+    """A loaded graph. Safe to run from several threads at once.
+
+    Raises BundleError if onnxruntime is older than the bundle asks for, cannot load the file, or finds other
+    inputs or outputs in it than the manifest says.
+    """
+
+    def __init__(self, path: Path, contract: manifest.Graph, threads: int, onnxruntime_min: str) -> None:
+        import onnxruntime  # here, because it costs more than the rest of the package together
+
+        _check_version(onnxruntime.__version__, onnxruntime_min, path)
+        self._path = path
+        try:
+            self._session = onnxruntime.InferenceSession(
+                path, _options(onnxruntime, threads), providers=["CPUExecutionProvider"]
+            )
+        except Exception as e:  # onnxruntime's exceptions share no base but Exception
+            raise BundleError(f"{path}: onnxruntime cannot load it ({_first_line(e)}); export again") from e
+        _check_names(path, "inputs", contract.inputs, self._session.get_inputs())
+        _check_names(path, "outputs", contract.outputs, self._session.get_outputs())
+        self.inputs = tuple(t.name for t in contract.inputs)
+        self.outputs = tuple(t.name for t in contract.outputs)
+
+    def run(self, outputs: Sequence[str], feeds: dict[str, Array]) -> list[Array]:
+        """The named outputs for `feeds`. Raises InputError if onnxruntime refuses them."""
+        try:
+            result: list[Array] = self._session.run(list(outputs), feeds)
+        except Exception as e:
+            raise InputError(f"{self._path}: onnxruntime refused the input ({_first_line(e)})") from e
+        return result
+
+
+def _options(onnxruntime: Any, threads: int) -> Any:
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = threads
+    options.inter_op_num_threads = 1
+    options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
+    options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_ENABLE_ALL
+    options.log_severity_level = 3  # errors only: everything that matters is raised
+    # Threads that spin between calls take the CPU from whatever else runs on the vehicle.
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    options.add_session_config_entry("session.set_denormal_as_zero", "1")
+    return options
+
+
+def _check_version(installed: str, smallest: str, path: Path) -> None:
+    if _numbers(installed) < _numbers(smallest):
+        raise BundleError(f"{path}: onnxruntime {installed} found, {smallest} or newer expected; update it")
+
+
+def _numbers(version: str) -> tuple[int, ...]:
+    parts = version.split("+")[0].split(".")[:3]
+    return tuple(int(part) if part.isdigit() else 0 for part in parts)
+
+
+def _check_names(path: Path, what: str, expected: list[manifest.Tensor], found: list[Any]) -> None:
+    names, wanted = sorted(t.name for t in found), sorted(t.name for t in expected)
+    if names != wanted:
+        raise BundleError(f"{path}: {what} {names} found, the manifest says {wanted}; export it again")
+
+
+def _first_line(error: Exception) -> str:
+    return " ".join(str(error).split())[:200]
