@@ -1,0 +1,57 @@
+"""What an export's parity and an evaluation look like as JSON and as text."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+
+from hcnaf_cli.output import table
+from hcnaf_runtime.manifest import ParityRow
+
+if TYPE_CHECKING:
+    from hcnaf_export.evaluation import Scores
+    from hcnaf_export.training.toy import Divergence
+
+
+def parity_json(rows: Sequence[ParityRow]) -> list[dict[str, Any]]:
+    """Every row."""
+    return [msgspec.to_builtins(row) for row in rows]
+
+
+def parity_text(rows: Sequence[ParityRow]) -> str:
+    """PyTorch against onnxruntime: a line per graph and output."""
+    head = ["graph ", "output ", "max abs", "max rel", "rms", "tolerance", "PyTorch", "onnxruntime", "verdict "]
+    return table(head, [_parity_row(row) for row in rows])
+
+
+def _parity_row(row: ParityRow) -> list[str]:
+    differences = [f"{value:.2e}" for value in (row.max_abs, row.max_rel, row.rms)]
+    worst = [f"{value:.7g}" for value in (row.torch, row.onnx)]
+    return [
+        row.graph,
+        row.output,
+        *differences,
+        f"{row.tolerance:.0e}",
+        *worst,
+        "passed" if row.passed else "FAILED",
+    ]
+
+
+def scores_text(scores: "Scores") -> str:
+    """A heading, a line per horizon, and what the numbers can be held against."""
+    head, *rows = scores.table()
+    what = f"{scores.predictor} on {scores.data}, {scores.split}"
+    title = f"{what}: {scores.windows} windows in {scores.clusters} scenes"
+    last = f"mean NLL {scores.mean:.3f} ± {scores.mean_error:.3f}; label noise alone has {scores.floor:.3f}"
+    return "\n".join([title, table(head, rows), last])
+
+
+def toy_json(found: Sequence["Divergence"]) -> list[dict[str, Any]]:
+    """Every condition."""
+    return [row._asdict() for row in found]
+
+
+def toy_text(found: Sequence["Divergence"]) -> str:
+    """Divergence from the known density: a line per condition."""
+    rows = [[r.name, "yes" if r.seen else "no", f"{r.kl:.4f} ± {r.error:.4f}"] for r in found]
+    return table(["condition ", "trained on", "KL (nats)"], rows)
