@@ -46,7 +46,7 @@ class ConditionConfig:
     """A flow whose hyper-network is an MLP over a vector of `size` numbers (toy distributions).
 
     Args:
-        hidden: widths of the hidden layers; the last one is the rank of the head.
+        hidden: widths of the hidden layers; the last one is the rank of the head. () is linear in the condition.
         location, scale: units of the flow, one number for all dimensions.
     """
 

@@ -59,7 +59,10 @@ class Emission(nn.Module):
         """Sum of squares of every output row, off-diagonal blocks included: [..., D, H_out]."""
         own, lower = layer.diagonal.square().sum(-1), layer.lower.square().sum(-1)
         starts = [d * (d - 1) // 2 for d in range(self.spec.dims + 1)]
-        parts = [lower[..., a:b, :].sum(-2) for a, b in pairwise(starts)]
+        # The first dimension has no blocks below the diagonal. Its zeros are written out: over an empty axis
+        # onnxruntime's ReduceSum returns an empty tensor (onnxruntime #8146).
+        none = torch.zeros_like(own[..., 0, :])
+        parts = [lower[..., a:b, :].sum(-2) if b > a else none for a, b in pairwise(starts)]
         return own + torch.stack(parts, dim=-2)
 
     def _to_natural_units(self, layer: Layer, scale: Tensor) -> Layer:

@@ -90,7 +90,8 @@ def forward(spec: FlowSpec, theta: Tensor, x: Tensor) -> Image:
         h = torch.tanh(a)
     c = context(spec, rest[-1], h)
     w = rest[-1].diagonal.transpose(-1, -2)
-    log_dz = torch.log(torch.clamp(t @ w, min=1e-38)) + log_scale
+    # The floor is the smallest normal number: 1e-38 would be zero where denormals are flushed, as in the runtime.
+    log_dz = torch.log(torch.clamp(t @ w, min=1.2e-38)) + log_scale
     return Image(*(_points(v) for v in (h @ w + c, log_dz, down @ w + c, up @ w + c)))
 
 

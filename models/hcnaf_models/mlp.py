@@ -54,7 +54,7 @@ class ConditionHyperNet(nn.Module):
         super().__init__()
         self.config = config
         self.body = mlp(config.size, config.hidden)
-        self.head = Head(config.flow, config.hidden[-1])
+        self.head = Head(config.flow, (config.size, *config.hidden)[-1])
 
     def forward(self, condition: Tensor) -> Tensor:
         features = self.body(condition).unsqueeze(-2)

@@ -32,11 +32,17 @@ def log_phi(z: Tensor) -> Tensor:
 
 def log_erfcx(u: Tensor) -> Tensor:
     """log(exp(u^2) erfc(u)) for u >= 0."""
-    t = 1.0 / (1.0 + 0.5 * u)
-    p = torch.full_like(t, _ERFCX[-1])
-    for c in reversed(_ERFCX[:-1]):
-        p = p * t + c
+    t, p = _fit(u)
     return p + torch.log(t)
+
+
+def _fit(u: Tensor) -> tuple[Tensor, Tensor]:
+    """t and P(t) with erfcx(u) = t exp(P(t))."""
+    t = 1.0 / (1.0 + 0.5 * u)
+    p = t * _ERFCX[-1] + _ERFCX[-2]
+    for c in reversed(_ERFCX[:-2]):
+        p = p * t + c
+    return t, p
 
 
 def log_left_tail(z: Tensor) -> Tensor:
@@ -68,6 +74,12 @@ def cdf(z: Tensor) -> Tensor:
     return torch.where(z > 0.0, 1.0 - tail, tail)
 
 
+def erf_fraction(z: Tensor, a: Tensor, b: Tensor) -> Tensor:
+    """`interval_fraction` by erf alone: fast, with an absolute error of about 1e-7 / (Phi(b) - Phi(a))."""
+    bottom, top = torch.erf(a * math.sqrt(0.5)), torch.erf(b * math.sqrt(0.5))
+    return (torch.erf(z * math.sqrt(0.5)) - bottom) / torch.clamp(top - bottom, min=1e-30)
+
+
 def interval_fraction(z: Tensor, a: Tensor, b: Tensor) -> Tensor:
     """(Phi(z) - Phi(a)) / (Phi(b) - Phi(a)) for a <= z <= b: the truncated normal's distribution function.
 
@@ -86,8 +98,8 @@ def interval_fraction(z: Tensor, a: Tensor, b: Tensor) -> Tensor:
 
 def _scaled_tail(u: Tensor, m: Tensor) -> Tensor:
     """exp(m^2 / 2) Phi(-u) for u >= |m|, m <= 0."""
-    exponent = 0.5 * (m - u) * (m + u) + log_erfcx(u * math.sqrt(0.5))
-    return 0.5 * torch.exp(exponent)
+    t, p = _fit(u * math.sqrt(0.5))
+    return (0.5 * t) * torch.exp(p + 0.5 * (m - u) * (m + u))
 
 
 def _scaled_cdf(z: Tensor, m: Tensor) -> Tensor:

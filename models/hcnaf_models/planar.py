@@ -5,104 +5,132 @@ r"""Exact distribution functions of a two-dimensional flow (a Knothe-Rosenblatt 
 
 Everything that depends on x alone (dimension 1, and its context for dimension 2) is computed once per x and
 broadcast over y. `normalised` support uses the formulas above, `paper` support Phi alone.
-Arrays over y are laid out [..., H, S, E], so that contexts broadcast along contiguous memory.
+
+Written for the graphs that ship, where this is the hot path. Arrays over y are [B, S, H, E], one small product
+per x; the limits z_2(-), z_2(+) ride along as the images of y = -+`FAR`; and for narrow layers the context of an x
+is one more column of the weights, met by a unit that is always 1, which saves a pass over [B, S, H, E] per layer.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
-from hcnaf_models.flow import Layer, distribution, split
+from hcnaf_models.normal import cdf, interval_fraction
 from hcnaf_models.spec import FlowSpec
 
+Fraction = Callable[[Tensor, Tensor, Tensor], Tensor]
+"""(Phi(z) - Phi(a)) / (Phi(b) - Phi(a)) of z, a, b."""
 
-def marginal_cdf(spec: FlowSpec, theta: Tensor, x: Tensor) -> Tensor:
+FAR = 1e30
+"""A y (or x) whose first-layer units are all saturated, in either direction."""
+
+SURE = 20.0
+"""tanh(20) is 1 in float32 and within 1e-17 of it in float64: the argument of the unit that is always 1."""
+
+NARROW = 48
+"""Up to this many hidden units contexts go into the weights; beyond, copying the weights costs more."""
+
+
+class PlanarLayer(NamedTuple):
+    """Blocks of one layer of a flow with D = 2: weights [B, H_out, H_in], biases [B, H_out, 1]."""
+
+    W_11: Tensor
+    W_22: Tensor
+    W_21: Tensor
+    B_1: Tensor
+    B_2: Tensor
+
+
+def marginal_cdf(spec: FlowSpec, theta: Tensor, x: Tensor, fraction: Fraction = interval_fraction) -> Tensor:
     """F_1 at x [B, K] under theta [B, P]: [B, K]."""
-    location, stack = split(spec, theta)
-    hidden = first_dimension(stack, x - location[..., :1])
-    last = stack[-1]
-    z = _first(last, hidden[-1])
-    limits = limit_paths([_own(layer, 0) for layer in stack], _first_biases(stack))
-    return distribution(spec, z, *limits)
+    location, _, stack = cut(spec, theta)
+    u = torch.cat([x - location, *_infinities(x)], dim=-1).unsqueeze(-2)
+    for layer in stack[:-1]:
+        u = torch.tanh(layer.W_11 @ u + layer.B_1)
+    z = (stack[-1].W_11 @ u + stack[-1].B_1).squeeze(-2)
+    return _distribution(spec, z, fraction)
 
 
-def conditional_cdf(spec: FlowSpec, theta: Tensor, x: Tensor, y: Tensor) -> Tensor:
-    """F_2(y | x) at x [B, S] and y [B, S, E] or [E] under theta [B, P]: [B, S, E]."""
-    location, stack = split(spec, theta)
-    contexts = second_contexts(stack, first_dimension(stack, x - location[..., :1]))
-    own = [_own(layer, 1) for layer in stack]
-    z = second_dimension(own, contexts, y - location[..., 1:].unsqueeze(-1))
-    minus, plus = limit_paths(own, contexts)
-    return distribution(spec, z, minus.unsqueeze(-1), plus.unsqueeze(-1))
+def conditional_cdf(
+    spec: FlowSpec, theta: Tensor, x: Tensor, y: Tensor, fraction: Fraction = interval_fraction
+) -> Tensor:
+    """F_2(y | x) at x [B, S] and y [B, S, E] or [B, 1, E] under theta [B, P]: [B, S, E]."""
+    m_1, m_2, stack = cut(spec, theta)
+    v = y - m_2.unsqueeze(-1)
+    h = torch.cat([v, *_infinities(v)], dim=-1).unsqueeze(-2)  # [B, S or 1, 1, E + 2]
+    if spec.hidden <= NARROW:
+        h = torch.cat([h, torch.ones_like(h)], dim=-2)
+    contexts = second_contexts(stack, (x - m_1).unsqueeze(-2))
+    for layer, c in zip(stack[:-1], contexts[:-1], strict=True):
+        h = torch.tanh(_advance(spec, layer.W_22, c, h, carry=True))
+    z = _advance(spec, stack[-1].W_22, contexts[-1], h, carry=False).squeeze(-2)
+    return _distribution(spec, z, fraction)
 
 
-def cell_mass(spec: FlowSpec, theta: Tensor, x: Tensor, weight: Tensor, y: Tensor) -> Tensor:
+def cell_mass(
+    spec: FlowSpec, theta: Tensor, x: Tensor, weight: Tensor, y: Tensor, fraction: Fraction = interval_fraction
+) -> Tensor:
     """Masses of cells: sum_s weight_cs (F_2(y_{j+1} | x_s) - F_2(y_j | x_s)), [B, E - 1, C].
 
     Args:
         theta: [B, P].
-        x: [B, S], one node per sub-column (m).
-        weight: [B, C, S], the exact F_1 increment of sub-column s in row c of the column that holds it.
-        y: [E], cell edges (m).
+        x: [B, S], nodes (m).
+        weight: [B, C, S], what node s counts for in column c; a column's weights sum to its increment of F_1.
+        y: [B, E], cell edges, ascending (m).
+        fraction: how F_2 is computed from z_2 and its limits.
     """
-    F = conditional_cdf(spec, theta, x, y)
+    F = conditional_cdf(spec, theta, x, y.unsqueeze(-2), fraction)
     increments = torch.clamp(F[..., 1:] - F[..., :-1], min=0.0)  # [B, S, E - 1]
     return increments.transpose(-1, -2) @ weight.transpose(-1, -2)
 
 
-def first_dimension(stack: list[Layer], x: Tensor) -> list[Tensor]:
-    """x and h_1^k for k = 1 .. L at x [B, S], relative to the location: L + 1 tensors [B, H, S]."""
-    h = torch.tanh(_own(stack[0], 0) * x.unsqueeze(-2) + _bias(stack[0], 0))
-    hidden = [h]
-    for layer in stack[1:-1]:
-        h = torch.tanh(_own(layer, 0) @ h + _bias(layer, 0))
-        hidden.append(h)
-    return [x.unsqueeze(-2), *hidden]
+def cut(spec: FlowSpec, theta: Tensor) -> tuple[Tensor, Tensor, list[PlanarLayer]]:
+    """theta [B, P] as the locations m_1, m_2 [B, 1] and the layers."""
+    shapes = [(1, 1)] * 2
+    for k in range(1, spec.layers + 2):
+        rows, columns = spec.fan_out(k), spec.fan_in(k)
+        shapes += [(rows, columns)] * 3 + [(rows, 1)] * 2
+    parts = torch.split(theta, [rows * columns for rows, columns in shapes], dim=-1)
+    blocks = [part.reshape(-1, *shape) for part, shape in zip(parts[2:], shapes[2:], strict=True)]
+    return parts[0], parts[1], [PlanarLayer(*blocks[i : i + 5]) for i in range(0, len(blocks), 5)]
 
 
-def second_contexts(stack: list[Layer], inputs: list[Tensor]) -> list[Tensor]:
-    """c_2^k = W_21^k h_1^{k-1} + B_2^k for k = 1 .. L + 1: [B, H, S] (last: [B, 1, S])."""
-    first = _lower(stack[0]) * inputs[0] + _bias(stack[0], 1)
-    rest = [_lower(layer) @ h + _bias(layer, 1) for layer, h in zip(stack[1:], inputs[1:], strict=True)]
-    return [first, *rest]
+def second_contexts(stack: list[PlanarLayer], u: Tensor) -> list[Tensor]:
+    """c_2^k = W_21^k h_1^{k-1} + B_2^k, k = 1 .. L + 1, at u = x - m_1 [B, 1, S]: [B, H, S] (last: [B, 1, S])."""
+    contexts = []
+    for layer in stack[:-1]:
+        contexts.append(layer.W_21 @ u + layer.B_2)
+        u = torch.tanh(layer.W_11 @ u + layer.B_1)
+    return [*contexts, stack[-1].W_21 @ u + stack[-1].B_2]
 
 
-def second_dimension(own: list[Tensor], contexts: list[Tensor], y: Tensor) -> Tensor:
-    """z_2 at y [B, S, E] or [B, 1, E], relative to the location: [B, S, E]."""
-    h = torch.tanh(own[0].unsqueeze(-1) * y.unsqueeze(-3) + contexts[0].unsqueeze(-1))  # [B, H, S, E]
-    B, _, S, E = h.shape
-    for w, c in zip(own[1:], contexts[1:], strict=True):
-        a = (w @ h.reshape(B, -1, S * E)).reshape(B, -1, S, E) + c.unsqueeze(-1)
-        h = torch.tanh(a) if w is not own[-1] else a
-    return h.squeeze(-3)
+def _advance(spec: FlowSpec, W: Tensor, c: Tensor, h: Tensor, *, carry: bool) -> Tensor:
+    """W h_s + c_s for every x_s: W [B, H_out, H_in], c [B, H_out, S], h [B, S, H_in, E] -> [B, S, H_out, E].
+
+    For narrow layers h ends with the unit that is always 1, and so does the result if `carry`.
+    """
+    columns = c.transpose(-1, -2).unsqueeze(-1)  # [B, S, H_out, 1]
+    if spec.hidden > NARROW:
+        return W.unsqueeze(1) @ h + columns
+    if carry:
+        W = torch.nn.functional.pad(W, (0, 0, 0, 1))
+        columns = torch.nn.functional.pad(columns, (0, 0, 0, 1), value=SURE)
+    W = W.unsqueeze(1).expand(-1, c.shape[-1], -1, -1)
+    return torch.cat([W, columns], dim=-1) @ h
 
 
-def limit_paths(own: list[Tensor], contexts: list[Tensor]) -> tuple[Tensor, Tensor]:
-    """z_d(-) and z_d(+) [B, S]: the own path started at h_d^1 = -1 and +1."""
-    h = torch.ones_like(contexts[0])
-    up, down = h, -h
-    for w, c in zip(own[1:-1], contexts[1:-1], strict=True):
-        up, down = torch.tanh(w @ up + c), torch.tanh(w @ down + c)
-    w, c = own[-1], contexts[-1]
-    return (w @ down + c).squeeze(-2), (w @ up + c).squeeze(-2)
+def _distribution(spec: FlowSpec, z: Tensor, fraction: Fraction) -> Tensor:
+    """F [..., E] from z [..., E + 2], whose last two entries are its limits z(-) and z(+)."""
+    inner = z[..., :-2]
+    if spec.support == "paper":
+        return cdf(inner)
+    return fraction(inner, z[..., -2:-1], z[..., -1:])
 
 
-def _own(layer: Layer, d: int) -> Tensor:
-    return layer.diagonal[..., d, :, :]
-
-
-def _lower(layer: Layer) -> Tensor:
-    return layer.lower[..., 0, :, :]
-
-
-def _bias(layer: Layer, d: int) -> Tensor:
-    return layer.bias[..., d, :].unsqueeze(-1)
-
-
-def _first(layer: Layer, h: Tensor) -> Tensor:
-    return (_own(layer, 0) @ h + _bias(layer, 0)).squeeze(-2)
-
-
-def _first_biases(stack: list[Layer]) -> list[Tensor]:
-    return [_bias(layer, 0) for layer in stack]
+def _infinities(v: Tensor) -> tuple[Tensor, Tensor]:
+    far = torch.full_like(v[..., :1], FAR)
+    return -far, far

@@ -7,11 +7,12 @@ The mass of the cell [x_a, x_b] x [y_a, y_b] is
 exact in y, a quadrature in x (see `quadrature`). A column's cells telescope to its increment of F_1 times
 what F_2 leaves inside the window, whatever the quadrature, so a map never loses or invents mass.
 
-Every column is refined on its own until two successive rules agree and F_1 is resolved by the nodes: where
-the density is wide two and four nodes do; for a ridge narrower than a cell it takes up to a few hundred.
+    F_1 at all edges --> columns that hold mass --> one node in each (Halo) --> columns in doubt --> more nodes (RULES)
+
+Columns of all maps are pooled in tiles. In a tile only the rows are computed where F_2 changes: it is monotone in y,
+so a few landmarks bound exactly what lies outside them. What is left out is therefore known: it is the certificate.
 """
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Protocol
@@ -19,15 +20,22 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from hcnaf_runtime.quadrature import Rule
+from hcnaf_runtime.quadrature import Halo, Rule
+from hcnaf_runtime.tiles import Tiles, batches, cut
 
 Float32 = npt.NDArray[np.float32]
 Float64 = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.intp]
 Mask = npt.NDArray[np.bool_]
 
-RULES = (Rule(1, 2), *(Rule(2**k, 4) for k in range(7)))
-"""The rules tried in turn; the last one has 256 nodes per column."""
+HALO = Halo(2, Rule(1, 2))
+"""The first try: the centre of every column, and two neighbours on either side."""
+
+RULES = tuple(Rule(2**k, 4) for k in range(7))
+"""Rules tried in turn where the first try is in doubt; the last one has 256 nodes per column."""
+
+WIDTH = 64
+"""Most columns in a tile, and most nodes in one where each column has several."""
 
 NEGLIGIBLE = 1e-9
 """Columns with less mass are left empty; thousands of them do not add up to what float32 resolves near 1."""
@@ -36,8 +44,11 @@ SATURATED = 1e-9, 1.5e-7
 """What float32 resolves near 0 and near 1: F_2 this close to its value at the window's edge is flat up to it."""
 
 RESOLVED = 1e-3
-"""A column's nodes may miss F_1 by this share of its mass. A spike between two nodes misses it by far more,
-and would otherwise pass for converged, since no rule sees it; accuracy itself is judged by the cells."""
+"""A rule's nodes may miss F_1 by this share of a column's mass. A spike between two nodes misses it by far
+more, and would otherwise pass for converged, since no rule sees it; accuracy itself is judged by the cells."""
+
+LANDMARKS = 16
+"""At about so many rows F_2 is looked at first."""
 
 CHUNK = 1 << 18
 """Numbers in the widest intermediate of a graph run, nodes x edges x hidden units: 1 MiB stays in cache."""
@@ -57,135 +68,197 @@ class Distribution(Protocol):
         """F_2 [B, S, E] at `y` [B, S, E] given `x` [B, S] (m)."""
 
     def cell_mass(self, theta: Float32, x: Float32, weight: Float32, y: Float32) -> Float32:
-        """[B, E - 1, C]: sum over s of weight [B, C, S] times F_2's increments along y [E] given x [B, S]."""
+        """[B, E - 1, C]: sum over s of weight [B, C, S] times F_2's increments along y [B, E] given x [B, S]."""
 
 
 @dataclass(frozen=True)
 class Window:
-    """The edges of the cells' columns and rows, float32 [C + 1] and [R + 1] (m)."""
+    """The edges of the cells' columns and rows, equally spaced, float32 [C + 1] and [R + 1] (m)."""
 
     x: Float32
     y: Float32
 
-    def strips(self, most: int) -> Iterator["Window"]:
-        """The window from left to right in parts of at most about `most` cells."""
-        width = max(1, most // (len(self.y) - 1))
-        return (Window(self.x[c : c + width + 1], self.y) for c in range(0, len(self.x) - 1, width))
+
+@dataclass(frozen=True)
+class Cells:
+    """Maps of a window."""
+
+    mass: Float32
+    """[B, R, C]."""
+    error: Float64
+    """[B]: what the quadrature may miss in the worst cell, as far as refinement can tell."""
+    lost: Float64
+    """[B]: the mass inside the window that was left out; at most `lost_mass`."""
 
 
 def masses(
-    flow: Distribution, theta: Float32, window: Window, tolerance: float, chunk: int = CHUNK
-) -> tuple[Float32, Float64]:
-    """Mass of every cell [B, R, C], and the quadrature error [B]: the largest last difference of a cell.
+    flow: Distribution,
+    theta: Float32,
+    window: Window,
+    tolerance: float,
+    lost_mass: float = 0.0,
+    chunk: int = CHUNK,
+) -> Cells:
+    """The mass of every cell.
 
-    A column is refined until its cells change by less than `tolerance`. Memory beyond the result is bounded
-    by `chunk`, whatever the size of the window.
+    A column is refined until its cells change by less than `tolerance`. Columns and rows are left out while what they
+    hold stays below `lost_mass` per map; with 0 only what float32 cannot tell from nothing. Memory beyond
+    the result is bounded by `chunk`, whatever the size of the window and the number of maps.
     """
-    edges = np.broadcast_to(window.x, (len(theta), len(window.x)))
-    columns = np.diff(flow.marginal_cdf(theta, edges).astype(np.float64), axis=1)
-    mass = np.zeros((len(theta), len(window.y) - 1, len(window.x) - 1), np.float32)
-    error = np.zeros(len(theta))
-    for b, share in enumerate(columns):
-        error[b] = _Map(flow, theta[b : b + 1], window, mass[b], chunk).fill(share, tolerance)
-    return np.maximum(mass, 0.0, out=mass), error
+    return _Filling(flow, theta, window, tolerance, lost_mass, chunk).run()
 
 
-@dataclass(frozen=True)
-class _Map:
-    """One map being filled: theta [1, P], its window and its cells [R, C]."""
+class _Filling:
+    """Maps being filled, with what is known of each column: its share of the mass [B, C] and error [B, C]."""
 
-    flow: Distribution
-    theta: Float32
-    window: Window
-    mass: Float32
-    chunk: int
+    def __init__(
+        self, flow: Distribution, theta: Float32, window: Window, tolerance: float, lost_mass: float, chunk: int
+    ) -> None:
+        self.flow, self.theta, self.window, self.chunk = flow, theta, window, chunk
+        rows = len(window.y) - 1
+        # Each end of a tile's columns may lose a fifth, the columns left out a half: together below lost_mass.
+        self.ends = max(lost_mass / 5.0, SATURATED[0]), max(lost_mass / 5.0, SATURATED[1])
+        self.marks = np.append(np.arange(0, rows, max(1, rows // LANDMARKS)), rows)
+        self.share = self._shares()
+        self.kept = _kept(self.share, lost_mass / 2.0)
+        self.mass = np.zeros((len(theta), rows, len(window.x) - 1), np.float32)
+        self.error = np.where(self.kept, 0.0, self.share if lost_mass == 0.0 else 0.0)
+        self.lost = np.where(self.kept, 0.0, self.share).sum(axis=1)
+        self.goal = np.maximum(tolerance, _noise(window.x) * self.share)
 
-    def fill(self, share: Float64, tolerance: float) -> float:
-        """Fill the columns, whose masses are `share` [C]; the largest error that is left in a cell."""
-        error = np.maximum(share, 0.0)  # a cell cannot be wrong by more than its column holds
-        goal = np.maximum(tolerance, _noise(self.window.x) * share)
-        pending = np.flatnonzero(share > NEGLIGIBLE)
+    def run(self) -> Cells:
+        self._centres()
+        pending = self.error > self.goal
         for rule in RULES:
-            for columns in self._batches(rule, pending):
-                error[columns] = np.minimum(self._refine(rule, columns, goal[columns]), share[columns])
-            pending = pending[error[pending] > goal[pending]]
-        return float(error.max())
-
-    def _batches(self, rule: Rule, columns: Indices) -> Iterator[Indices]:
-        nodes = max(2 * len(rule.support), rule.size * len(self._landmarks))
-        size = max(1, self.chunk // (self.flow.hidden * nodes))
-        return (columns[i : i + size] for i in range(0, len(columns), size))
-
-    def _refine(self, rule: Rule, columns: Indices, goal: Float64) -> Float64:
-        """Compute `columns` by `rule`; the error [k] of their cells, infinite if not known."""
-        x, weight, resolved = self._nodes(rule, columns, goal)
-        fresh = np.zeros((len(self.mass), len(columns)), np.float32)
-        low, high = self._rows(x)
-        for some, rows in _groups(low, high, self.chunk // (self.flow.hidden * rule.size)):
-            fresh[rows, some] = self._cells(x[some], weight[some], rows)
-        change = np.abs(fresh - self.mass[:, columns]).max(axis=0)
-        negative = -np.minimum(fresh, 0.0).sum(axis=0)  # will be cut off, and then the column's sum is off
-        self.mass[:, columns] = fresh
-        judged = resolved & (rule is not RULES[0])
-        return np.where(judged, np.maximum(change, negative), np.inf)
-
-    def _nodes(self, rule: Rule, columns: Indices, goal: Float64) -> tuple[Float32, Float32, Mask]:
-        """The nodes [k, S], their weights [k, S], and whether they resolve F_1 [k], of each column."""
-        left = self.window.x[columns].astype(np.float64)[:, None]
-        right = self.window.x[columns + 1].astype(np.float64)[:, None]
-        places = np.concatenate([rule.support, rule.checks])
-        x = (left + (right - left) * places).astype(np.float32)
-        cdf = self.flow.marginal_cdf(self.theta, x.reshape(1, -1)).reshape(x.shape).astype(np.float64)
-        F, at_checks = np.split(cdf, [len(rule.support)], axis=1)
-        allowed = np.maximum(RESOLVED * (F[:, -1] - F[:, 0]), goal)
-        weight = rule.weights(F).astype(np.float32)
-        return x[:, rule.nodes], weight, rule.misfit(F, at_checks) <= allowed
-
-    @property
-    def _landmarks(self) -> Indices:
-        """Every n-th of the n² rows' edges, the first and the last included."""
-        rows = len(self.mass)
-        return np.append(np.arange(0, rows, math.isqrt(rows)), rows)
-
-    def _rows(self, x: Float32) -> tuple[Indices, Indices]:
-        """First and last + 1 row [k] outside which F_2 given `x` [k, S] has nothing: F_2 is monotone in y."""
-        marks = self._landmarks
-        y = np.broadcast_to(self.window.y[marks], (1, x.size, len(marks)))
-        cdf = self.flow.conditional_cdf(self.theta, x.reshape(1, -1), y).reshape(*x.shape, len(marks))
-        empty = np.count_nonzero((cdf <= cdf[..., :1] + SATURATED[0]).all(axis=1), axis=1)
-        full = np.count_nonzero((cdf >= cdf[..., -1:] - SATURATED[1]).all(axis=1), axis=1)
-        low, high = np.maximum(empty - 1, 0), np.minimum(len(marks) - full, len(marks) - 1)
-        return marks[low], marks[np.maximum(low, high)]
-
-    def _cells(self, x: Float32, weight: Float32, rows: slice) -> Float32:
-        """Mass [rows, k] of the cells of k columns with the nodes `x` and weights [k, S]."""
-        k, size = x.shape
-        spread = np.zeros((k, k, size), np.float32)
-        spread[np.arange(k), np.arange(k)] = weight
-        spread = spread.reshape(1, k, k * size)
-        step = max(1, self.chunk // (self.flow.hidden * x.size))
-        parts = [
-            self.flow.cell_mass(
-                self.theta, x.reshape(1, -1), spread, self.window.y[row : min(row + step, rows.stop) + 1]
-            )[0]
-            for row in range(rows.start, rows.stop, step)
-        ]
-        return np.concatenate(parts)
-
-
-def _groups(low: Indices, high: Indices, budget: int) -> Iterator[tuple[slice, slice]]:
-    """Runs of columns whose common rows, times their number, stay within `budget`: (columns, rows)."""
-    start = 0
-    while start < len(low):
-        bottom, top, stop = int(low[start]), int(high[start]), start + 1
-        while stop < len(low):
-            wider = min(bottom, int(low[stop])), max(top, int(high[stop]))
-            if (wider[1] - wider[0] + 1) * (stop + 1 - start) > budget:
+            if not pending.any():
                 break
-            (bottom, top), stop = wider, stop + 1
-        if top > bottom:
-            yield slice(start, stop), slice(bottom, top)
-        start = stop
+            self._refine(rule, pending)
+            pending &= self.error > self.goal
+        np.maximum(self.mass, 0.0, out=self.mass)
+        return Cells(self.mass, self.error.max(axis=1), self.lost)
+
+    def _shares(self) -> Float64:
+        """Increments of F_1 [B, C]."""
+        B, edges = len(self.theta), len(self.window.x)
+        step = max(1, self.chunk // (self.flow.hidden * edges))
+        shares = np.empty((B, edges - 1))
+        for b in range(0, B, step):
+            theta = self.theta[b : b + step]
+            cdf = self.flow.marginal_cdf(theta, np.broadcast_to(self.window.x, (len(theta), edges)))
+            shares[b : b + step] = np.diff(cdf.astype(np.float64), axis=1)
+        return np.maximum(shares, 0.0, out=shares)
+
+    def _centres(self) -> None:
+        """One node per column."""
+        reach, C = HALO.reach, len(self.window.x) - 1
+        pitch = (float(self.window.x[-1]) - float(self.window.x[0])) / C
+        tiles = cut(self.kept, WIDTH, gap=2 * reach)
+        for some in batches(tiles.count, np.ones_like(tiles.count), self._budget(len(self.marks))):
+            tile = tiles.some(some)
+            w = tile.columns.shape[1]
+            weights, misfit = self._weights(tile, HALO.rule)
+            first = tile.columns[:, :1] - reach + np.arange(w + 2 * reach)
+            x = (float(self.window.x[0]) + (first + 0.5) * pitch).astype(np.float32)
+            weight = np.zeros((len(tile), 2 * w, w + 2 * reach), np.float32)
+            for k in range(2 * reach + 1):
+                weight[:, np.arange(w), np.arange(w) + k] = weights @ HALO.spread[:, k]
+                weight[:, np.arange(w) + w, np.arange(w) + k] = weights @ HALO.doubt[:, k]
+            doubt = np.zeros((len(tile), w))
+            negative = np.zeros((len(tile), w))
+            for j, rows, block in self._blocks(tile, x, weight):
+                n = int(tile.count[j])
+                columns = slice(int(tile.columns[j, 0]), int(tile.columns[j, 0]) + n)
+                self.mass[tile.maps[j]][rows, columns] = block[:, :n]
+                doubt[j] = np.maximum(doubt[j], np.abs(block[:, w:]).max(axis=0))
+                negative[j] -= np.minimum(block[:, :w], 0.0).sum(axis=0)
+            self._judge(tile, np.maximum(np.maximum(doubt, negative), misfit))
+
+    def _refine(self, rule: Rule, pending: Mask) -> None:
+        """Several nodes in each of the columns pending [B, C], judged by what changes."""
+        tiles = cut(pending, max(1, WIDTH // rule.size))
+        for some in batches(tiles.count * rule.size, np.ones_like(tiles.count), self._budget(len(self.marks))):
+            tile = tiles.some(some)
+            J, w = tile.columns.shape
+            weights, misfit = self._weights(tile, rule)
+            x = self._places(tile, rule.support[rule.nodes]).reshape(J, -1)
+            weight = np.zeros((J, w, w, rule.size), np.float32)
+            weight[:, np.arange(w), np.arange(w)] = weights
+            before = self.mass[tile.maps[:, None], :, tile.columns]  # [J, w, R]
+            self.mass[tile.maps[:, None], :, tile.columns] = 0.0
+            negative = np.zeros((J, w))
+            for j, rows, block in self._blocks(tile, x, weight.reshape(J, w, -1)):
+                n = int(tile.count[j])
+                self.mass[tile.maps[j]][rows, tile.columns[j, :n]] = block[:, :n]
+                negative[j] -= np.minimum(block, 0.0).sum(axis=0)
+            change = np.abs(self.mass[tile.maps[:, None], :, tile.columns] - before).max(axis=-1)
+            share = self.share[tile.maps[:, None], tile.columns]
+            goal = self.goal[tile.maps[:, None], tile.columns]
+            unresolved = misfit > np.maximum(RESOLVED * share, goal)
+            self._judge(tile, np.where(unresolved, np.inf, np.maximum(change, negative)))
+
+    def _judge(self, tile: Tiles, error: Float64) -> None:
+        """Note the errors [J, w] of a tile's columns: none is wrong by more than it holds."""
+        own = tile.own
+        maps = np.broadcast_to(tile.maps[:, None], own.shape)[own]
+        columns = tile.columns[own]
+        self.error[maps, columns] = np.minimum(error[own], self.share[maps, columns])
+
+    def _weights(self, tile: Tiles, rule: Rule) -> tuple[Float64, Float64]:
+        """Weights [J, w, S] of the rule's nodes in each column, zero in padding, and its misfit of F_1 [J, w]."""
+        x = self._places(tile, np.concatenate([rule.support, rule.checks]))
+        cdf = self.flow.marginal_cdf(self.theta[tile.maps], x.reshape(len(tile), -1)).reshape(x.shape)
+        F, at_checks = np.split(cdf.astype(np.float64), [len(rule.support)], axis=-1)
+        return rule.weights(F) * tile.own[:, :, None], rule.misfit(F, at_checks)
+
+    def _places(self, tile: Tiles, share: Float64) -> Float32:
+        """Points [J, w, n] at these shares [n] of the way from each column's left edge to its right."""
+        left = self.window.x[tile.columns].astype(np.float64)[..., None]
+        right = self.window.x[tile.columns + 1].astype(np.float64)[..., None]
+        return (left + (right - left) * share).astype(np.float32)
+
+    def _blocks(self, tile: Tiles, x: Float32, weight: Float32) -> Iterator[tuple[int, slice, Float32]]:
+        """Of each tile the rows that hold anything, and what weight [J, n, S] makes of them: [rows, n]."""
+        low, high = self._rows(tile, x, weight)
+        tall = max(1, self.chunk // (self.flow.hidden * x.shape[1]) - 3)
+        pieces = -(-(high - low) // tall)
+        owner = np.repeat(np.arange(len(tile)), pieces)
+        rank = np.arange(len(owner)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+        start = low[owner] + rank * tall
+        stop = np.minimum(start + tall, high[owner])
+        ones = np.ones_like(start)
+        for some in batches(stop - start + 3, ones, self._budget(x.shape[1])):
+            which, first, last = owner[some], start[some], stop[some]
+            rows = np.minimum(first[:, None] + np.arange((last - first).max() + 1), last[:, None])
+            out = self.flow.cell_mass(self.theta[tile.maps[which]], x[which], weight[which], self.window.y[rows])
+            for i, j in enumerate(which):
+                yield int(j), slice(int(first[i]), int(last[i])), out[i, : last[i] - first[i]]
+
+    def _rows(self, tile: Tiles, x: Float32, weight: Float32) -> tuple[Indices, Indices]:
+        """First and last + 1 row [J] outside which there is nothing, and the certificate for it."""
+        y = np.broadcast_to(self.window.y[self.marks], (*x.shape, len(self.marks)))
+        cdf = self.flow.conditional_cdf(self.theta[tile.maps], x, y)
+        used = (weight[:, : tile.columns.shape[1]] != 0.0).any(axis=1)[..., None]  # padding decides nothing
+        empty = np.count_nonzero(((cdf <= cdf[..., :1] + self.ends[0]) | ~used).all(axis=1), axis=1)
+        full = np.count_nonzero(((cdf >= cdf[..., -1:] - self.ends[1]) | ~used).all(axis=1), axis=1)
+        low = np.maximum(empty - 1, 0)
+        high = np.maximum(np.minimum(len(self.marks) - full, len(self.marks) - 1), low)
+        j = np.arange(len(tile))
+        outside = (cdf[j, :, low] - cdf[..., 0]) + (cdf[..., -1] - cdf[j, :, high])  # [J, S]
+        lost = np.einsum("jcs,js->j", weight[:, : tile.columns.shape[1]], outside, dtype=np.float64)
+        np.add.at(self.lost, tile.maps, np.maximum(lost, 0.0))
+        return self.marks[low], self.marks[high]
+
+    def _budget(self, other: int) -> int:
+        return max(1, self.chunk // (self.flow.hidden * other))
+
+
+def _kept(share: Float64, budget: float) -> Mask:
+    """Columns [B, C] to compute: all but the smallest, which together hold at most `budget` per map."""
+    ascending = np.sort(share, axis=1)
+    dropped = np.count_nonzero(np.cumsum(ascending, axis=1) <= budget, axis=1)
+    threshold = np.take_along_axis(ascending, np.maximum(dropped - 1, 0)[:, None], axis=1)
+    threshold = np.where(dropped[:, None] > 0, threshold, 0.0)
+    return np.asarray(share > np.maximum(threshold, NEGLIGIBLE))
 
 
 def _noise(x: Float32) -> Float64:

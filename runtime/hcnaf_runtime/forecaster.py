@@ -117,8 +117,8 @@ class Forecaster:
     def _agent_maps(self, theta: Theta, grid: Grid, tolerance: float) -> tuple[Float32, Float64]:
         A, T, P = theta.values.shape
         window = cells.Window(grid.x_edges, grid.y_edges)
-        mass, error = cells.masses(self.flow, theta.values.reshape(A * T, P), window, tolerance)
-        return mass.reshape(A, T, grid.height, grid.width), error.reshape(A, T)
+        found = cells.masses(self.flow, theta.values.reshape(A * T, P), window, tolerance)
+        return found.mass.reshape(A, T, grid.height, grid.width), found.error.reshape(A, T)
 
     def _scene_maps(self, theta: Theta, grid: Grid, tolerance: float) -> tuple[Float32, Float64]:
         A, T, _ = theta.values.shape

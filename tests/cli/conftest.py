@@ -47,7 +47,7 @@ def make_bundle(folder):
     }
     golden = {}
     for name in bundle.manifest.graphs:
-        y = np.float32([0, 1] * 2) if name == "cell_mass" else rng.normal(size=(2, 4, 5)).astype(np.float32)
+        y = np.float32([[0, 1], [2, 4]]) if name == "cell_mass" else rng.normal(size=(2, 4, 5)).astype(np.float32)
         session = bundle.session(name, 1)
         inputs = {key: (feeds | {"y": y})[key] for key in session.inputs}
         golden |= {f"in.{name}.{key}": value for key, value in inputs.items()}

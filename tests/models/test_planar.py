@@ -8,7 +8,7 @@ import torch
 from scipy import integrate, stats
 
 from hcnaf_models import FlowSpec, flow, planar
-from hcnaf_models.normal import interval_fraction, log_interval
+from hcnaf_models.normal import erf_fraction, interval_fraction, log_interval
 from tests.models.flows import name, random_theta
 
 SPECS = [
@@ -45,7 +45,7 @@ def masses(spec, theta, edges, parts=512):
         weight[0, c, c * parts : (c + 1) * parts] = (F[1:] - F[:-1])[c * parts : (c + 1) * parts]
     nodes = 0.5 * (fine[1:] + fine[:-1])
     y = torch.tensor(edges, dtype=torch.float64)
-    return planar.cell_mass(spec, theta[None], nodes[None], weight, y)[0], F, nodes, y
+    return planar.cell_mass(spec, theta[None], nodes[None], weight, y[None])[0], F, nodes, y
 
 
 @pytest.mark.parametrize("spec", SPECS, ids=name)
@@ -66,7 +66,8 @@ def test_columns_telescope(spec):
     mass, F, nodes, _ = masses(spec, theta, edges, parts=3)
     increments = (F[1:] - F[:-1]).reshape(-1, 3)
     if spec.support == "paper":
-        top = planar.conditional_cdf(spec, theta[None], nodes[None], torch.tensor([[[-1e5, 1e5]]]).double())
+        ends = torch.tensor([[[-1e5, 1e5]]], dtype=torch.float64)
+        top = planar.conditional_cdf(spec, theta[None], nodes[None], ends)
         increments = increments * (top[0, :, 1] - top[0, :, 0]).reshape(-1, 3)
     torch.testing.assert_close(mass.sum(0), increments.sum(1), rtol=0, atol=1e-9)
 
@@ -89,10 +90,25 @@ def test_conditional_cdf_takes_edges_shared_or_per_column():
     spec = SPECS[0]
     theta = torch.stack([random_theta(spec, s) for s in (1, 2)])
     x, y = torch.randn(2, 5, dtype=torch.float64), torch.linspace(-3, 3, 7, dtype=torch.float64)
-    shared = planar.conditional_cdf(spec, theta, x, y)
+    shared = planar.conditional_cdf(spec, theta, x, y.expand(2, 1, 7))
     own = planar.conditional_cdf(spec, theta, x, y.expand(2, 5, 7))
-    torch.testing.assert_close(shared, own, rtol=0, atol=0)
+    torch.testing.assert_close(shared, own, rtol=0, atol=1e-14)
     assert shared.shape == (2, 5, 7)
+
+
+@pytest.mark.parametrize("spec", SPECS, ids=name)
+def test_distribution_functions_come_from_the_images_of_forward(spec):
+    """The hot path, with contexts folded into the weights, against the flow's one primitive."""
+    theta = random_theta(spec, 14)
+    x = torch.randn(1, 6, dtype=torch.float64) + 1.0
+    y = 2.0 * torch.randn(1, 6, 9, dtype=torch.float64)
+    pairs = torch.stack([x.unsqueeze(-1).expand_as(y), y], dim=-1).reshape(1, -1, 2)
+    image = flow.forward(spec, theta[None], pairs)
+    F = flow.distribution(spec, image.z, image.z_minus, image.z_plus)
+    torch.testing.assert_close(
+        planar.conditional_cdf(spec, theta[None], x, y).reshape(1, -1), F[..., 1], rtol=0, atol=1e-9
+    )
+    torch.testing.assert_close(planar.marginal_cdf(spec, theta[None], pairs[..., 0]), F[..., 0], rtol=0, atol=1e-9)
 
 
 BOUNDS = [(-1.0, 2.0), (-12.0, -11.0), (5.0, 30.0), (-30.0, 30.0), (-40.0, -39.9), (0.0, 0.5), (9.0, 9.001)]
@@ -115,3 +131,9 @@ def test_interval_fraction_runs_from_zero_to_one(a, b):
     np.testing.assert_allclose(F.numpy(), expected, atol=3e-7)
     assert float(F[0]) == 0.0
     assert float(F[-1]) == 1.0
+
+
+def test_erf_fraction_is_accurate_where_the_interval_holds_much():
+    z = torch.linspace(-2.0, 3.0, 33)
+    expected = stats.truncnorm.cdf(z.double().numpy(), -2.0, 3.0)
+    np.testing.assert_allclose(erf_fraction(z, z[0], z[-1]).numpy(), expected, atol=3e-7)

@@ -127,7 +127,7 @@ def _write_golden(folder):
             "theta": theta,
             "x": np.float32([[0]]),
             "weight": np.float32([[[1]]]),
-            "y": np.float32([0, 1]),
+            "y": np.float32([[0, 1]]),
         },
         "hypernet": {
             "past": np.ones((1, 3, 5), np.float32),

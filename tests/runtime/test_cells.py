@@ -6,7 +6,7 @@ from gaussian_bundle import make_theta
 from scipy.stats import norm
 
 from hcnaf_runtime import Grid
-from hcnaf_runtime.cells import Window, masses
+from hcnaf_runtime.cells import CHUNK, Window, masses
 
 GAUSSIANS = {
     "wide": (5, 1, 2, 1.5, 0.5),
@@ -20,6 +20,11 @@ GAUSSIANS = {
     "wider than the window": (0, 0, 30, 20, 0.3),
     "half outside": (75, 0, 2, 2, 0.9),
 }
+
+
+def found(flow, theta, window, tolerance, chunk=CHUNK):
+    cells = masses(flow, theta, window, tolerance, chunk=chunk)
+    return cells.mass, cells.error
 
 
 def _window(grid):
@@ -47,7 +52,7 @@ def _truth(theta, window, panels=24):
 @pytest.mark.parametrize("name", GAUSSIANS)
 def test_cells_columns_and_error(name, forecaster):
     theta = make_theta(*GAUSSIANS[name])
-    mass, error = masses(forecaster.flow, theta, WINDOW, 1e-6)
+    mass, error = found(forecaster.flow, theta, WINDOW, 1e-6)
     truth = _truth(theta, WINDOW)
     assert np.abs(mass[0] - truth).max() < 2e-6
     assert error[0] < 5e-6
@@ -58,7 +63,7 @@ def test_cells_columns_and_error(name, forecaster):
 def test_what_cannot_be_resolved_is_confessed(forecaster):
     """A ridge a millimetre thin across half a metre: the reported error covers the real one."""
     theta = make_theta(0.01, 0.01, 0.02, 0.02, 0.999)
-    mass, error = masses(forecaster.flow, theta, WINDOW, 1e-6)
+    mass, error = found(forecaster.flow, theta, WINDOW, 1e-6)
     real = np.abs(mass[0] - _truth(theta, WINDOW, panels=2000)).max()
     assert 1e-5 < real <= error[0]
     assert mass.sum(dtype=np.float64) == pytest.approx(1, abs=1e-6)
@@ -69,18 +74,18 @@ def test_column_sums_are_exact_whatever_the_tolerance(forecaster):
     edges = np.broadcast_to(WINDOW.x, (1, len(WINDOW.x)))
     columns = np.diff(forecaster.flow.marginal_cdf(theta, edges)[0])
     for tolerance in (1e-2, 1e-6):
-        mass, _ = masses(forecaster.flow, theta, WINDOW, tolerance)
+        mass, _ = found(forecaster.flow, theta, WINDOW, tolerance)
         slack = max(tolerance, 1e-6)
         np.testing.assert_allclose(mass[0].sum(axis=0), columns, atol=slack)
 
 
 def test_batch_equals_stacked_singles(forecaster):
     theta = np.concatenate([make_theta(*values) for values in GAUSSIANS.values()])
-    together, error = masses(forecaster.flow, theta, WINDOW, 1e-6)
+    together, error = found(forecaster.flow, theta, WINDOW, 1e-6)
     for b in range(len(theta)):
-        alone, own_error = masses(forecaster.flow, theta[b : b + 1], WINDOW, 1e-6)
-        np.testing.assert_array_equal(together[b], alone[0])
-        assert error[b] == own_error[0]
+        alone, own_error = found(forecaster.flow, theta[b : b + 1], WINDOW, 1e-6)
+        np.testing.assert_allclose(together[b], alone[0], atol=1e-8)  # padding changes the order of sums
+        assert error[b] == pytest.approx(own_error[0], abs=1e-8)
 
 
 @pytest.mark.parametrize("name", ["wide", "narrow diagonal", "long ridge", "wider than the window"])
@@ -88,29 +93,29 @@ def test_batch_equals_stacked_singles(forecaster):
 def test_chunked_equals_whole(name, chunk, forecaster):
     window = _window(Grid(60, 50, 0.5).at(-2, -10))
     theta = make_theta(*GAUSSIANS[name])
-    whole, _ = masses(forecaster.flow, theta, window, 1e-6)
-    chunked, _ = masses(forecaster.flow, theta, window, 1e-6, chunk)
+    whole, _ = found(forecaster.flow, theta, window, 1e-6)
+    chunked, _ = found(forecaster.flow, theta, window, 1e-6, chunk)
     np.testing.assert_allclose(chunked, whole, atol=1e-7)
 
 
 def test_a_window_is_a_part_of_a_larger_one(forecaster):
     theta = make_theta(*GAUSSIANS["long ridge"])
-    whole, _ = masses(forecaster.flow, theta, WINDOW, 1e-6)
-    part, _ = masses(forecaster.flow, theta, Window(WINDOW.x[60:110], WINDOW.y[90:120]), 1e-6)
+    whole, _ = found(forecaster.flow, theta, WINDOW, 1e-6)
+    part, _ = found(forecaster.flow, theta, Window(WINDOW.x[60:110], WINDOW.y[90:120]), 1e-6)
     np.testing.assert_allclose(part[0], whole[0, 90:119, 60:109], atol=2e-6)
 
 
 def test_finer_cells_add_up_to_coarser_ones(forecaster):
     theta = make_theta(*GAUSSIANS["narrow diagonal"])
-    coarse, _ = masses(forecaster.flow, theta, _window(Grid(20, 20, 0.5).at(-5, -5)), 1e-6)
-    fine, _ = masses(forecaster.flow, theta, _window(Grid(40, 40, 0.25).at(-5, -5)), 1e-6)
+    coarse, _ = found(forecaster.flow, theta, _window(Grid(20, 20, 0.5).at(-5, -5)), 1e-6)
+    fine, _ = found(forecaster.flow, theta, _window(Grid(40, 40, 0.25).at(-5, -5)), 1e-6)
     summed = fine[0].reshape(20, 2, 20, 2).sum(axis=(1, 3))
     np.testing.assert_allclose(summed, coarse[0], atol=4e-6)
 
 
 @pytest.mark.parametrize("mean", [1e4, -1e6])
 def test_nothing_inside_is_nothing(mean, forecaster):
-    mass, error = masses(forecaster.flow, make_theta(mean, mean, 1, 1, 0), WINDOW, 1e-6)
+    mass, error = found(forecaster.flow, make_theta(mean, mean, 1, 1, 0), WINDOW, 1e-6)
     assert mass.max() == 0
     assert error[0] == 0
 
@@ -118,13 +123,13 @@ def test_nothing_inside_is_nothing(mean, forecaster):
 def test_a_huge_grid(forecaster):
     window = _window(Grid(4000, 3000, 0.02).at(-20, -30))
     theta = make_theta(10, 0, 0.5, 0.3, 0.8)
-    mass, error = masses(forecaster.flow, theta, window, 1e-6)
+    mass, error = found(forecaster.flow, theta, window, 1e-6)
     assert mass.sum(dtype=np.float64) == pytest.approx(1, abs=2e-6)
     assert error[0] < 5e-6
 
 
 def test_a_single_cell(forecaster):
     theta = make_theta(0, 0, 1, 1, 0)
-    mass, _ = masses(forecaster.flow, theta, Window(np.float32([-1, 1]), np.float32([-2, 2])), 1e-6)
+    mass, _ = found(forecaster.flow, theta, Window(np.float32([-1, 1]), np.float32([-2, 2])), 1e-6)
     expected = (norm.cdf(1) - norm.cdf(-1)) * (norm.cdf(2) - norm.cdf(-2))
     assert mass[0, 0, 0] == pytest.approx(expected, abs=1e-6)

@@ -1,0 +1,60 @@
+"""How far an exported graph may be from PyTorch, output by output, and why.
+
+The error of a value v against PyTorch's v* is |v - v*| / max(1, |v*| / knee): absolute up to |v*| = knee, relative
+beyond. Both sides compute in float32 (24 bits, 6e-8 relative) and sum products in different orders.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.floating]
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """`limit` on the error as defined above, for the `reason` given."""
+
+    limit: float
+    knee: float
+    reason: str
+
+    def error(self, found: Array, expected: Array) -> npt.NDArray[np.float64]:
+        """The error of every value; infinite where either side is not finite."""
+        a, b = found.astype(np.float64), expected.astype(np.float64)
+        finite = np.isfinite(a) & np.isfinite(b)
+        a, b = np.where(finite, a, 0.0), np.where(finite, b, 0.0)
+        return np.where(finite, np.abs(a - b) / self.scale(b), np.inf)
+
+    def scale(self, expected: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        """max(1, |v*| / knee)."""
+        return np.maximum(1.0, np.abs(expected) / self.knee)
+
+
+_PROBABILITY = "a probability; float32 resolves 6e-8 near 1 and z carries a few units in the last place"
+
+TOLERANCES: dict[tuple[str, str], Tolerance] = {
+    ("hypernet", "theta"): Tolerance(1e-4, 1.0, "a hundred float32 layers deep, then exp: relative to the weight"),
+    ("hypernet", "pose"): Tolerance(1e-5, 1.0, "gathered, and one atan2"),
+    ("flow", "log_prob"): Tolerance(
+        1e-4, 50.0, "nats; -z^2/2 turns an error e of z into |z| e, with |z| < 10 here"
+    ),
+    ("flow", "z"): Tolerance(2e-5, 1.0, "a sum over H units of magnitude above |z|"),
+    ("flow", "log_det"): Tolerance(1e-4, 50.0, "nats; sums of L + 1 logarithms of positive sums"),
+    ("marginal_cdf", "cdf"): Tolerance(2e-6, 1.0, _PROBABILITY),
+    ("conditional_cdf", "cdf"): Tolerance(2e-6, 1.0, _PROBABILITY),
+    ("cell_mass", "mass"): Tolerance(1e-6, 1.0, "the promise made for cell masses"),
+    ("path", "log_prob"): Tolerance(1e-4, 50.0, "nats; the promise made from scene to density"),
+}
+"""By graph and output. `path` is the hyper-network followed by the flow, as a forecast uses them."""
+
+GOLDEN_FACTOR = 4.0
+"""Golden outputs are re-checked on other processors, whose kernels sum in yet another order."""
+
+
+def tolerance(graph: str, output: str) -> Tolerance:
+    """The tolerance of one output."""
+    return TOLERANCES[graph, output]
