@@ -74,7 +74,7 @@ def shipped_fraction(z: Tensor, a: Tensor, b: Tensor) -> Tensor:
     least = (torch.erf(b * math.sqrt(0.5)) - torch.erf(a * math.sqrt(0.5))).min() * 0.5
     # Branches may neither return nor share their inputs (torch.cond), hence the copies; the exporter drops them.
     branches = (erf_fraction, interval_fraction)
-    F: Tensor = torch.cond(least > ERF_FROM, *branches, (z.clone(), a.clone(), b.clone()))
+    F: Tensor = torch.cond(least > ERF_FROM, *branches, tuple(v.clone(memory_format=torch.contiguous_format) for v in (z, a, b)))
     return F
 
 

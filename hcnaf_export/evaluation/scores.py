@@ -1,0 +1,106 @@
+"""Mean scores with honest standard errors, as data: what tables and model cards are written from."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+
+class Score(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One horizon.
+
+    Attributes:
+        horizon: s.
+        nll: mean negative log-likelihood of the labels, nats per m². error: its standard error.
+        baseline, baseline_error: the same of the constant-velocity Gaussian.
+        gain: baseline - nll of the same windows. gain_error: its standard error (paired: much smaller than
+            the two errors apart).
+    """
+
+    horizon: float
+    nll: float
+    error: float
+    baseline: float
+    baseline_error: float
+    gain: float
+    gain_error: float
+
+
+class Scores(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Scores of one predictor on one split.
+
+    Attributes:
+        predictor: what was scored. data: the data set. split: of it.
+        windows: snippets scored. clusters: groups of them that are taken as independent.
+        rows: one per horizon.
+        mean: mean NLL over the horizons, nats per m². mean_error: its standard error.
+        floor: entropy of the label noise, nats per m²; no predictor's expected NLL lies below it.
+    """
+
+    predictor: str
+    data: str
+    split: str
+    windows: int
+    clusters: int
+    rows: tuple[Score, ...]
+    mean: float
+    mean_error: float
+    floor: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain data, fit for JSON."""
+        plain: dict[str, Any] = msgspec.to_builtins(self)
+        return plain
+
+    def table(self) -> list[tuple[str, ...]]:
+        """Header and rows of text, one row per horizon: NLLs and gain with their standard errors."""
+        head = ("horizon (s)", "NLL (nats/m²)", "constant velocity", "gain")
+        rows = [
+            (
+                f"{r.horizon:g}",
+                f"{r.nll:.3f} ± {r.error:.3f}",
+                f"{r.baseline:.3f} ± {r.baseline_error:.3f}",
+                f"{r.gain:.3f} ± {r.gain_error:.3f}",
+            )
+            for r in self.rows
+        ]
+        return [head, *rows]
+
+
+def mean_and_error(values: ArrayLike, cluster: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Means [Q] of values [W, Q] and their standard errors, with windows of one cluster taken as dependent.
+
+    The cluster-robust error: sqrt(C / (C - 1) sum_c (sum_{i in c} (v_i - mean))²) / W. With windows that
+    overlap in time it is far larger than the naive std / sqrt(W), and right. NaN for a single cluster.
+    """
+    v = np.asarray(values, dtype=np.float64)
+    _, group = np.unique(np.asarray(cluster), return_inverse=True)
+    C = int(group.max()) + 1
+    sums = np.zeros((C, v.shape[1]))
+    np.add.at(sums, group, v - v.mean(axis=0))
+    factor = C / (C - 1) if C > 1 else np.nan
+    return v.mean(axis=0), np.sqrt(factor * np.square(sums).sum(axis=0)) / len(v)
+
+
+def summarise(
+    horizons: tuple[float, ...],
+    nll: NDArray[np.float64],
+    baseline: NDArray[np.float64],
+    cluster: NDArray[np.int64],
+    **about: Any,
+) -> Scores:
+    """Scores from the NLL [W, Q] of a predictor and of the baseline, and each window's cluster [W]."""
+    columns = [column for v in (nll, baseline, baseline - nll) for column in mean_and_error(v, cluster)]
+    rows = tuple(Score(t, *(float(v) for v in row)) for t, *row in zip(horizons, *columns, strict=True))
+    mean, error = mean_and_error(nll.mean(axis=1, keepdims=True), cluster)
+    return Scores(
+        windows=len(nll),
+        clusters=len(np.unique(cluster)),
+        rows=rows,
+        mean=float(mean[0]),
+        mean_error=float(error[0]),
+        **about,
+    )

@@ -1,0 +1,172 @@
+import numpy as np
+import onnx
+import pytest
+import torch
+
+from hcnaf_export.graphs import graphs
+from hcnaf_export.onnx_file import EXAMPLE_SIZES, write_onnx
+from hcnaf_export.parity import compare_graph, contract, run_torch
+from hcnaf_export.probes import SCENES, SceneSetting, flow_cases, scene
+from hcnaf_models.config import ConditionConfig
+from hcnaf_models.model import build
+from hcnaf_models.spec import FlowSpec
+from hcnaf_runtime.session import Session
+
+POM_GRAPHS = ("hypernet", "flow", "marginal_cdf", "conditional_cdf", "cell_mass")
+
+
+def part(exported, name):
+    return next(g for g in graphs(exported.model) if g.name == name)
+
+
+def session(exported, name):
+    graph = part(exported, name)
+    return Session(exported.path / graph.file, contract(graph), 1, "1.20")
+
+
+def ones(graph, sizes):
+    """An input of the given sizes for every tensor of the graph; the values are small and differ."""
+    rng = np.random.default_rng(1)
+    feeds = {}
+    for tensor in graph.inputs:
+        shape = [sizes.get(s, 1) if isinstance(s, str) else s for s in tensor.shape]
+        if tensor.dtype == "int64":
+            feeds[tensor.name] = np.arange(shape[0])
+        elif tensor.dtype == "int8":
+            feeds[tensor.name] = rng.integers(-127, 128, shape).astype(np.int8)
+        else:
+            feeds[tensor.name] = np.sort(rng.uniform(0.1, 1.0, shape), axis=-1).astype(np.float32)
+    return feeds
+
+
+def same(graph, found, feeds, limit=2e-5):
+    for a, b in zip(found, run_torch(graph, feeds), strict=True):
+        assert a.shape == b.shape
+        assert np.isfinite(a).all()
+        assert np.abs(a - b).max(initial=0.0) <= limit * max(1.0, np.abs(b).max(initial=0.0))
+
+
+@pytest.mark.parametrize("name", POM_GRAPHS)
+@pytest.mark.parametrize("sizes", [{"E": 2}, {"E": 3, "B": 2}, {"E": 9, "B": 4, "S": 2, "N": 3, "K": 5}])
+def test_every_size_may_be_one(pom, name, sizes):
+    graph = part(pom, name)
+    feeds = ones(graph, sizes)
+    same(graph, session(pom, name).run([t.name for t in graph.outputs], feeds), feeds)
+
+
+def test_a_scene_may_have_no_stops_and_nobody_else(pom):
+    graph = part(pom, "hypernet")
+    feeds = ones(graph, {"S": 0, "N": 1, "A": 1, "T": 1, "R": 1, "C": 1})
+    same(graph, session(pom, "hypernet").run(["theta", "pose"], feeds), feeds)
+
+
+@pytest.mark.parametrize("name", POM_GRAPHS)
+def test_files_are_plain_single_and_named(pom, name):
+    graph = part(pom, name)
+    model = onnx.load(pom.path / graph.file, load_external_data=False)
+    onnx.checker.check_model(model, full_check=True)
+    assert model.ir_version <= 10
+    assert [(o.domain, o.version) for o in model.opset_import] == [("", 18)]
+    assert not any(t.external_data for t in model.graph.initializer)
+    for value, tensor in zip(
+        [*model.graph.input, *model.graph.output], [*graph.inputs, *graph.outputs], strict=True
+    ):
+        shape = [d.dim_param or d.dim_value for d in value.type.tensor_type.shape.dim]
+        assert (value.name, shape) == (tensor.name, tensor.shape)
+
+
+def test_metadata_says_what_a_program_without_json_needs(pom):
+    facts = {p.key: p.value for p in onnx.load(pom.path / "hypernet.onnx").metadata_props}
+    flow = pom.model.config.flow
+    assert facts["hcnaf.format"] == "1"
+    assert facts["hcnaf.graph"] == "hypernet"
+    assert facts["hcnaf.kind"] == "pom"
+    assert facts["hcnaf.parameters"] == str(flow.parameters)
+    assert facts["hcnaf.channels"] == "drivable,direction_x,direction_y"
+    assert facts["hcnaf.optional_channels"] == "drivable,direction_y"
+    assert (facts["hcnaf.history"], float(facts["hcnaf.step"]), float(facts["hcnaf.horizon_max"])) == (
+        "10",
+        0.1,
+        4.0,
+    )
+
+
+def test_recurrent_networks_stay_recurrent_networks(pom):
+    operators = [node.op_type for node in onnx.load(pom.path / "hypernet.onnx").graph.node]
+    assert operators.count("LSTM") == 2
+    assert not {"Loop", "Scan", "If"} & set(operators)
+
+
+def test_one_horizon_at_a_time_is_all_at_once(pom):
+    feeds = scene(pom.model.config, SCENES["typical"], np.random.default_rng(5))
+    run = session(pom, "hypernet")
+    whole, _ = run.run(["theta", "pose"], feeds)
+    for k in range(len(feeds["horizons"])):
+        one, _ = run.run(["theta", "pose"], feeds | {"horizons": feeds["horizons"][k : k + 1]})
+        np.testing.assert_allclose(one[:, 0], whole[:, k], rtol=1e-5, atol=1e-5)
+
+
+def test_one_target_at_a_time_is_all_at_once(pom):
+    feeds = scene(pom.model.config, SCENES["gaps"], np.random.default_rng(6))
+    run = session(pom, "hypernet")
+    whole, poses = run.run(["theta", "pose"], feeds)
+    for k in range(len(feeds["target"])):
+        one, pose = run.run(["theta", "pose"], feeds | {"target": feeds["target"][k : k + 1]})
+        np.testing.assert_allclose(one[0], whole[k], rtol=1e-5, atol=1e-5)
+        np.testing.assert_allclose(pose[0], poses[k], rtol=1e-6)
+
+
+def test_a_target_does_not_see_itself_among_the_others(pom):
+    config = pom.model.config
+    feeds = scene(config, SceneSetting(agents=4, targets=1), np.random.default_rng(7))
+    found, _ = session(pom, "hypernet").run(["theta", "pose"], feeds)
+    alone = feeds["target"][0]
+    rest = [n for n in range(4) if n != alone]
+    moved = {"past": feeds["past"][[alone, *rest]], "size": feeds["size"][[alone, *rest]]}
+    again, _ = session(pom, "hypernet").run(["theta", "pose"], feeds | moved | {"target": np.array([0])})
+    np.testing.assert_allclose(again, found, rtol=1e-5, atol=1e-5)
+    empty = {"past": feeds["past"][[alone]], "size": feeds["size"][[alone]], "target": np.array([0])}
+    nobody, _ = session(pom, "hypernet").run(["theta", "pose"], feeds | empty)
+    assert np.abs(nobody - found).max() > 1e-3  # the others do matter
+
+
+def test_theta_does_not_depend_on_where_the_scene_lies(pom):
+    feeds = scene(pom.model.config, SceneSetting(), np.random.default_rng(8))
+    shift = np.array([64.0, -32.0], np.float32)  # exact in float32
+    moved = {name: feeds[name].copy() for name in ("past", "raster_origin", "stops")}
+    moved["past"][..., :2] += shift
+    moved["raster_origin"] += shift
+    moved["stops"][:, :2] += shift
+    run = session(pom, "hypernet")
+    a, pose = run.run(["theta", "pose"], feeds)
+    b, away = run.run(["theta", "pose"], feeds | moved)
+    np.testing.assert_allclose(b, a, rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(away[:, :2], pose[:, :2] + shift, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("spec", "name"),
+    [
+        (FlowSpec(layers=3, hidden=100), "flow"),
+        (FlowSpec(layers=3, hidden=100), "cell_mass"),
+        (FlowSpec(layers=2, hidden=20, support="paper"), "conditional_cdf"),
+    ],
+    ids=lambda v: v if isinstance(v, str) else f"H{v.hidden}L{v.layers}-{v.support}",
+)
+def test_other_flows_agree_with_pytorch(tmp_path, spec, name):
+    model = build(ConditionConfig(flow=spec))
+    graph = next(g for g in graphs(model) if g.name == name)
+    write_onnx(graph, tmp_path / graph.file, {})
+    rows = compare_graph(graph, tmp_path, list(flow_cases(name, spec, {}).values()))
+    assert [r.output for r in rows] == [t.name for t in graph.outputs]
+    assert all(r.passed for r in rows), rows
+
+
+def test_examples_are_never_of_size_one_and_tell_sizes_apart():
+    assert min(EXAMPLE_SIZES.values()) > 1
+    assert len(set(EXAMPLE_SIZES.values())) == len(EXAMPLE_SIZES)
+
+
+def test_a_graph_is_in_evaluation_mode(pom):
+    assert not any(m.training for g in graphs(pom.model) for m in g.module.modules())
+    assert torch.is_grad_enabled()
