@@ -48,6 +48,13 @@ _PYTHON = {
 }
 
 
+_COSTS = {
+    "nats": "change of log p (nats)",
+    "cell_mass": "change of a cell",
+    "total_variation": "total variation of a map",
+}
+
+
 def card(manifest: Manifest) -> str:
     """The card as Markdown."""
     sections = [
@@ -61,6 +68,8 @@ def card(manifest: Manifest) -> str:
         _scores(manifest.scores),
         "## Training",
         _facts(manifest.training),
+        "## Size and precision",
+        _size(manifest),
         "## Limits",
         _limits(manifest),
         "## Parity",
@@ -111,6 +120,30 @@ def _input(m: Manifest) -> str:
         f"- stop lines: {'read' if m.scene.stops else 'not read'}",
     ]
     return lines[0] + "\n\n" + "\n".join(lines[1:])
+
+
+def _size(m: Manifest) -> str:
+    """Bytes of every file, and what a precision below fp32 costs."""
+    files = {name: file.bytes for name, file in m.files.items() if name != FILE}
+    before = m.precision_cost.get("bytes_fp32", {})
+    header = ["file", "bytes", "as fp32"] if before else ["file", "bytes"]
+    rows = [[name, f"{size:,}", _bytes(before.get(name))][: len(header)] for name, size in files.items()]
+    total = ["all", f"{sum(files.values()):,}", ""][: len(header)]
+    text = f"The hyper-network's weights are stored as {m.precision}, the flow's arithmetic is float32."
+    parts = [text, table(header, [*rows, total])]
+    if "nats" in m.precision_cost:
+        parts.append(_cost(m.precision_cost))
+    return "\n\n".join(parts)
+
+
+def _bytes(size: int | None) -> str:
+    return "" if size is None else f"{size:,}"
+
+
+def _cost(cost: Mapping[str, Any]) -> str:
+    what = f"Against float32, over {cost['maps']} forecasts of {cost['measured_on']}:"
+    rows = [[text, *(_show(cost[n].get(k)) for k in ("mean", "max"))] for n, text in _COSTS.items() if n in cost]
+    return f"{what}\n\n{table(['', 'mean', 'max'], rows)}"
 
 
 def _limits(m: Manifest) -> str:

@@ -16,8 +16,13 @@ from hcnaf_models.config import ConditionConfig, ModelConfig, PomConfig
 from hcnaf_runtime import __version__
 from hcnaf_runtime import manifest as m
 
+HYPERNET_IN = ("hypernet", "forecast")
+"""The graphs that hold the hyper-network."""
 
-def metadata(name: str, graph: Graph, config: ModelConfig, optional: Sequence[str]) -> dict[str, str]:
+
+def metadata(
+    name: str, graph: Graph, config: ModelConfig, optional: Sequence[str], precision: m.Precision = "fp32"
+) -> dict[str, str]:
     """The manifest's essentials as text, so that a program needs no JSON. Lists are joined by commas."""
     flow = config.flow
     facts: dict[str, Any] = {
@@ -32,6 +37,7 @@ def metadata(name: str, graph: Graph, config: ModelConfig, optional: Sequence[st
         "parameters": flow.parameters,
         "support": flow.support,
         "weight_norm": flow.weight_norm,
+        "precision": precision if graph.name in HYPERNET_IN else "fp32",
         "inputs": ",".join(t.name for t in graph.inputs),
         "outputs": ",".join(t.name for t in graph.outputs),
     }
@@ -59,6 +65,8 @@ def manifest(
     rows: Sequence[m.ParityRow],
     training: Mapping[str, Any],
     scores: Mapping[str, Any],
+    precision: m.Precision = "fp32",
+    precision_cost: Mapping[str, Any] | None = None,
 ) -> m.Manifest:
     """The manifest of a bundle whose other `files` are complete."""
     flow = config.flow
@@ -83,6 +91,8 @@ def manifest(
         parity=list(rows),
         training=plain(training),
         scores=plain(scores),
+        precision=precision,
+        precision_cost=plain(precision_cost or {}),
         **_input(config, optional_channels(config, training)),
     )
 

@@ -4,6 +4,7 @@ Every size that may vary is named by a letter in the contract; the same letter i
 
     A  targets      N  agents in the scene, or points      T  horizons       R x C  raster rows and columns
     B  maps (agents x horizons, flattened)                 S  stop lines, or nodes in x       E  edges in y
+    U, V  edges of a grid in x and y
 """
 
 from __future__ import annotations
@@ -19,7 +20,6 @@ from hcnaf_models.config import PomConfig
 from hcnaf_models.geometry import pose_of
 from hcnaf_models.mlp import ConditionHyperNet
 from hcnaf_models.model import Hcnaf
-from hcnaf_models.normal import erf_fraction, interval_fraction
 from hcnaf_models.pom import PomHyperNet
 from hcnaf_models.raster import crop_raster
 from hcnaf_models.spec import FlowSpec
@@ -69,12 +69,12 @@ ERF_FROM = 0.1
 stable form is run, which takes ten times as long."""
 
 
-def shipped_fraction(z: Tensor, a: Tensor, b: Tensor) -> Tensor:
-    """`interval_fraction`, by erf where that is accurate enough for all of z: an `If` in the graph."""
-    least = (torch.erf(b * math.sqrt(0.5)) - torch.erf(a * math.sqrt(0.5))).min() * 0.5
-    # Branches may neither return nor share their inputs (torch.cond), hence the copies; the exporter drops them.
-    branches = (erf_fraction, interval_fraction)
-    F: Tensor = torch.cond(least > ERF_FROM, *branches, tuple(v.clone(memory_format=torch.contiguous_format) for v in (z, a, b)))
+def shipped_fraction(z: Tensor) -> Tensor:
+    """`planar.stable_fraction`, by erf where that is accurate enough for all of z: an `If` in the graph."""
+    limits = torch.erf(z[..., -2:] * math.sqrt(0.5))
+    least = (limits[..., 1] - limits[..., 0]).min() * 0.5
+    # A branch may not share its input with what surrounds it (torch.cond), hence the product; it is dropped.
+    F: Tensor = torch.cond(least > ERF_FROM, planar.fast_fraction, planar.stable_fraction, (z * 1.0,))
     return F
 
 
@@ -184,6 +184,12 @@ def _tensor(name: str, shape: str, unit: str, description: str, dtype: str = "fl
     """`shape` as words: a number is fixed, anything else names a size that varies."""
     sizes = [int(word) if word.isdigit() else word for word in shape.split()]
     return Contract(name=name, dtype=dtype, shape=sizes, unit=unit, description=description)
+
+
+def edges() -> tuple[Contract, Contract]:
+    """The edges of a grid's columns and rows."""
+    text = "cell edges, ascending, in the frame of theta"
+    return _tensor("x_edges", "U", "m", text), _tensor("y_edges", "V", "m", text)
 
 
 def _theta(spec: FlowSpec, lead: str = "B") -> Contract:

@@ -15,7 +15,7 @@ import numpy.typing as npt
 import torch
 
 from hcnaf_export.graphs import Graph
-from hcnaf_export.probes import Feeds, flow_cases, flow_feeds, hypernet_feeds
+from hcnaf_export.probes import Feeds, flow_cases, flow_feeds, forecast_feeds, hypernet_feeds
 from hcnaf_export.tolerances import Tolerance, tolerance
 from hcnaf_models.model import Hcnaf
 from hcnaf_runtime.errors import ParityError
@@ -33,7 +33,7 @@ def contract(graph: Graph) -> GraphContract:
     return GraphContract(file=graph.file, inputs=list(graph.inputs), outputs=list(graph.outputs))
 
 
-def _open(graph: Graph, folder: Path) -> Session:
+def open_graph(graph: Graph, folder: Path) -> Session:
     return Session(folder / graph.file, contract(graph), _THREADS, ONNXRUNTIME_MIN)
 
 
@@ -51,14 +51,17 @@ def compare(model: Hcnaf, graphs: Sequence[Graph], folder: Path) -> list[ParityR
     trained = {name: run_torch(by_name["hypernet"], feeds)[0] for name, feeds in scenes.items()}
     rows: list[ParityRow] = []
     for graph in graphs:
-        cases = scenes if graph.name == "hypernet" else flow_cases(graph.name, model.config.flow, trained)
+        if graph.name == "forecast":
+            cases = forecast_feeds(scenes)
+        else:
+            cases = scenes if graph.name == "hypernet" else flow_cases(graph.name, model.config.flow, trained)
         rows += compare_graph(graph, folder, list(cases.values()))
     return [*rows, _path(model, by_name, folder, scenes)]
 
 
 def compare_graph(graph: Graph, folder: Path, cases: Sequence[Feeds]) -> list[ParityRow]:
     """One row per output of one graph, over `cases`."""
-    session, names = _open(graph, folder), [t.name for t in graph.outputs]
+    session, names = open_graph(graph, folder), [t.name for t in graph.outputs]
     expected = [run_torch(graph, feeds) for feeds in cases]
     found = [session.run(names, feeds) for feeds in cases]
     outputs = zip(names, zip(*found, strict=True), zip(*expected, strict=True), strict=True)
@@ -117,7 +120,7 @@ def row(graph: str, output: str, pairs: Sequence[tuple[Array, Array]], limit: To
 def _path(model: Hcnaf, graphs: dict[str, Graph], folder: Path, scenes: dict[str, Feeds]) -> ParityRow:
     """From the hyper-network's inputs to log p, each side with its own theta."""
     spec, pairs = model.config.flow, []
-    hypernet, flow = _open(graphs["hypernet"], folder), _open(graphs["flow"], folder)
+    hypernet, flow = open_graph(graphs["hypernet"], folder), open_graph(graphs["flow"], folder)
     for feeds in scenes.values():
         expected = run_torch(graphs["hypernet"], feeds)[0].reshape(-1, spec.parameters)
         found = hypernet.run(["theta"], feeds)[0].reshape(expected.shape)

@@ -90,16 +90,36 @@ def _surroundings(config: PomConfig, setting: SceneSetting, rng: np.random.Gener
     return feeds
 
 
+def edges(setting: SceneSetting | None = None) -> Feeds:
+    """Edges of a grid that reaches everywhere, or of a single cell for a scene of a single agent."""
+    if setting is not None and setting.agents == 1:
+        return {"x_edges": np.array([-5.0, 25.0], np.float32), "y_edges": np.array([-8.0, 8.0], np.float32)}
+    ends = (np.array([-1e6]), np.array([1e6]))
+    x = np.concatenate([ends[0], np.linspace(-20.0, 60.0, 33), ends[1]])
+    y = np.concatenate([ends[0], np.linspace(-25.0, 25.0, 26), ends[1]])
+    return {"x_edges": x.astype(np.float32), "y_edges": y.astype(np.float32)}
+
+
+def forecast_feeds(scenes: dict[str, Feeds]) -> dict[str, Feeds]:
+    """Named inputs of forecast.onnx: those of the hyper-network, and a grid for each."""
+    return {name: feeds | edges(SCENES.get(name)) for name, feeds in scenes.items()}
+
+
 def conditions(config: ConditionConfig, rng: np.random.Generator) -> dict[str, Feeds]:
-    """Inputs of the condition graph."""
-    typical = rng.normal(size=(7, config.size)).astype(np.float32)
-    values = {
-        "typical": typical,
-        "single": typical[:1],
-        "corners": np.eye(config.size, dtype=np.float32),
-        "large": 4.0 * typical,
-        "denormal": np.full((2, config.size), DENORMAL, np.float32),
-    }
+    """Inputs of the condition graph: what the model is meant for and mixtures of it, or just anything."""
+    if config.examples:
+        known = np.array(config.examples, np.float32)
+        mixtures = rng.dirichlet(np.ones(len(known)), size=7) @ known
+        values = {"typical": mixtures.astype(np.float32), "single": known[:1], "examples": known}
+    else:
+        typical = rng.normal(size=(7, config.size)).astype(np.float32)
+        values = {
+            "typical": typical,
+            "single": typical[:1],
+            "corners": np.eye(config.size, dtype=np.float32),
+            "large": 4.0 * typical,
+            "denormal": np.full((2, config.size), DENORMAL, np.float32),
+        }
     return {name: {"condition": value} for name, value in values.items()}
 
 

@@ -35,6 +35,7 @@ class Tolerance:
 
 
 _PROBABILITY = "a probability; float32 resolves 6e-8 near 1 and z carries a few units in the last place"
+_FORECAST = "a probability; theta's own difference moves mass between cells"
 
 TOLERANCES: dict[tuple[str, str], Tolerance] = {
     ("hypernet", "theta"): Tolerance(1e-4, 1.0, "a hundred float32 layers deep, then exp: relative to the weight"),
@@ -47,12 +48,21 @@ TOLERANCES: dict[tuple[str, str], Tolerance] = {
     ("marginal_cdf", "cdf"): Tolerance(2e-6, 1.0, _PROBABILITY),
     ("conditional_cdf", "cdf"): Tolerance(2e-6, 1.0, _PROBABILITY),
     ("cell_mass", "mass"): Tolerance(1e-6, 1.0, "the promise made for cell masses"),
+    ("forecast", "mass"): Tolerance(1e-5, 1.0, _FORECAST),
+    ("forecast", "window_mass"): Tolerance(1e-5, 1.0, _FORECAST),
+    ("forecast", "pose"): Tolerance(1e-5, 1.0, "gathered, and one atan2"),
     ("path", "log_prob"): Tolerance(1e-4, 50.0, "nats; the promise made from scene to density"),
 }
 """By graph and output. `path` is the hyper-network followed by the flow, as a forecast uses them."""
 
 GOLDEN_FACTOR = 4.0
 """Golden outputs are re-checked on other processors, whose kernels sum in yet another order."""
+
+GOLDEN_INT8 = 0.05
+"""Of golden outputs where weights are int8: a rounding that falls the other way moves an output by 1/255."""
+
+MOST_NATS = {"fp16": 0.05, "int8": 0.5}
+"""Mean |change of log p| (nats) above which a precision is refused: the export has failed, not merely rounded."""
 
 
 def tolerance(graph: str, output: str) -> Tolerance:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 import click
 
+from hcnaf_cli.bench import bench
 from hcnaf_cli.errors import Commands
 from hcnaf_runtime._version import __version__
 
@@ -47,6 +48,13 @@ def main() -> None:
 @click.option("-o", "--out", type=_FILE, metavar="FORECAST.npz", help="Write the maps.")
 @click.option("--plot", type=_FILE, metavar="OUT.png", help="Draw the maps over the scene (extra `plot`).")
 @click.option("--grid", metavar="COLSxROWS@M", help="Cells of each map [default: 200x200@0.5].")
+@click.option(
+    "--lost-mass",
+    type=float,
+    default=0.0,
+    show_default=True,
+    help="Leave cells empty while they hold less together.",
+)
 @_horizons
 @_frame
 @_threads
@@ -58,6 +66,7 @@ def forecast(
     out: Path | None,
     plot: Path | None,
     grid: str | None,
+    lost_mass: float,
     horizons: str | None,
     frame: Literal["agent", "scene"],
     threads: int | None,
@@ -75,7 +84,8 @@ def forecast(
         _check_picture(plot)
     name, given = open_scene(scene, sample)
     forecaster = Forecaster(model, threads)
-    maps = forecaster.pom(given, None if grid is None else Grid.parse(grid), parse_horizons(horizons), frame)
+    cells = None if grid is None else Grid.parse(grid)
+    maps = forecaster.pom(given, cells, parse_horizons(horizons), frame, lost_mass=lost_mass)
     for note in maps.notes:
         talk(f"note: {note}")
     _write(out, plot, name, given, maps)
@@ -186,3 +196,6 @@ def verify(bundle: Path | None, threads: int | None, as_json: bool) -> None:
             f"{opened.path}: {failed} of {len(rows)} outputs differ from their golden values; "
             "do not use it on this machine"
         )
+
+
+main.add_command(bench)

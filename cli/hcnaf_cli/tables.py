@@ -1,6 +1,6 @@
 """What an export's parity and an evaluation look like as JSON and as text."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -35,6 +35,29 @@ def _parity_row(row: ParityRow) -> list[str]:
         *worst,
         "passed" if row.passed else "FAILED",
     ]
+
+
+_COSTS = {
+    "nats": "|change of log p| (nats)",
+    "cell_mass": "|change of a cell|",
+    "total_variation": "total variation",
+}
+
+
+def size_text(files: Mapping[str, int], cost: Mapping[str, Any]) -> str:
+    """Bytes of every file, and what the precision costs where it is below fp32."""
+    before = cost.get("bytes_fp32", {})
+    rows = [[name, f"{size:,}", f"{before[name]:,}" if name in before else ""] for name, size in files.items()]
+    rows.append(["all", f"{sum(files.values()):,}", ""])
+    lines = [table(["file ", "bytes", "as fp32" if before else ""], rows)]
+    if "nats" in cost:
+        found = [
+            [text, *(f"{cost[name][k]:.2e}" if k in cost[name] else "" for k in ("mean", "max"))]
+            for name, text in _COSTS.items()
+            if name in cost
+        ]
+        lines.append(table([f"against fp32, {cost['maps']} forecasts ", "mean", "max"], found))
+    return "\n".join(lines)
 
 
 def scores_text(scores: "Scores") -> str:

@@ -154,6 +154,35 @@ def argoverse2(recording: Path, out: Path, targets: Literal["scored", "focal", "
     _save(convert_argoverse2(recording, targets=targets), out)
 
 
+@convert.command()
+@click.argument("data", type=_PATH)
+@_scene
+@click.option("--split", type=click.Choice(["train", "val", "test"]), default="test", show_default=True)
+@click.option(
+    "--network", type=click.IntRange(min=0), default=0, show_default=True, help="Which network of the split."
+)
+@click.option("--window", type=click.IntRange(min=0), default=0, show_default=True, help="Which of its snippets.")
+@click.option(
+    "--targets", type=click.IntRange(min=1), default=8, show_default=True, help="Forecast at most so many."
+)
+def simulated(
+    data: Path, out: Path, split: Literal["train", "val", "test"], network: int, window: int, targets: int
+) -> None:
+    """A scene from a snippet of a data set that `hcnaf simulate` made."""
+    from hcnaf_export.data.tracks import Dataset
+    from hcnaf_runtime.errors import DataError
+
+    check_target(out)
+    networks = Dataset(data).split(split)
+    if network >= len(networks):
+        raise DataError(f"--network is {network}, {data} has {len(networks)} in {split}; count from 0")
+    windows = networks[network].windows
+    if window >= len(windows):
+        raise DataError(f"--window is {window}, network {network} has {len(windows)} snippets; count from 0")
+    track, step = (int(v) for v in windows[window])
+    _save(networks[network].scene(track, step, max_targets=targets), out)
+
+
 def _save(scene: "Scene", out: Path) -> None:
     with writing(out):
         scene.save(out)
@@ -168,8 +197,23 @@ def _save(scene: "Scene", out: Path) -> None:
 @click.option("--ckpt", type=_PATH, required=True, metavar="model.pt", help="Checkpoint of a training run.")
 @click.option("-o", "--out", type=_PATH, required=True, metavar="BUNDLE", help="Bundle directory to write.")
 @click.option("--force", is_flag=True, help="Replace a bundle that is already there.")
+@click.option(
+    "--precision",
+    type=click.Choice(["fp32", "fp16", "int8"]),
+    default="fp32",
+    show_default=True,
+    help="Of the hyper-network's weights; the flow keeps fp32.",
+)
+@click.option("--calibration", type=_PATH, metavar="DIR", help="Data set of `hcnaf simulate`, which int8 needs.")
 @_json
-def export(ckpt: Path, out: Path, force: bool, as_json: bool) -> None:
+def export(
+    ckpt: Path,
+    out: Path,
+    force: bool,
+    precision: Literal["fp32", "fp16", "int8"],
+    calibration: Path | None,
+    as_json: bool,
+) -> None:
     """Export a checkpoint to a bundle, checked against PyTorch output by output."""
     from hcnaf_cli import tables
     from hcnaf_export.export import export_bundle
@@ -178,17 +222,32 @@ def export(ckpt: Path, out: Path, force: bool, as_json: bool) -> None:
     try:
         with ProgressLine() as line:
             result = export_bundle(
-                ckpt, out, force=force, progress=lambda name, k, steps: line(f"{k + 1}/{steps}  {name}")
+                ckpt,
+                out,
+                force=force,
+                precision=precision,
+                calibration=calibration,
+                progress=lambda name, k, steps: line(f"{k + 1}/{steps}  {name}"),
             )
     except ParityError as error:
         if rows := getattr(error, "rows", ()):
             click.echo(tables.parity_text(rows))
         raise
     if as_json:
-        show_json({"path": str(result.path), "bytes": result.bytes, "parity": tables.parity_json(result.rows)})
+        show_json(
+            {
+                "path": str(result.path),
+                "bytes": result.bytes,
+                "files": result.files,
+                "precision": result.precision,
+                "precision_cost": result.cost,
+                "parity": tables.parity_json(result.rows),
+            }
+        )
     else:
         click.echo(tables.parity_text(result.rows))
-    talk(f"wrote {click.format_filename(out)} ({result.bytes / 1e6:.1f} MB)")
+        click.echo(tables.size_text(result.files, result.cost))
+    talk(f"wrote {click.format_filename(out)} ({result.precision}, {result.bytes / 1e6:.2f} MB)")
 
 
 @main.command()
@@ -198,6 +257,9 @@ def export(ckpt: Path, out: Path, force: bool, as_json: bool) -> None:
 @click.option("--split", type=click.Choice(["train", "val", "test"]), default="test", show_default=True)
 @click.option("--horizons", metavar="0.5,1,4", help="Seconds ahead [default: every half second].")
 @click.option("--limit", type=click.IntRange(min=0), default=0, help="Score at most about so many windows.")
+@click.option(
+    "--record", is_flag=True, help="Keep the scores in the checkpoint; exports carry them in their card."
+)
 @_device
 @_threads
 @_json
@@ -208,6 +270,7 @@ def evaluate(
     split: Literal["train", "val", "test"],
     horizons: str | None,
     limit: int,
+    record: bool,
     device: str,
     threads: int | None,
     as_json: bool,
@@ -219,8 +282,12 @@ def evaluate(
 
     if bundle and ckpt:
         raise click.UsageError("give --bundle or --ckpt, not both")
+    if record and not ckpt:
+        raise click.UsageError("--record needs --ckpt: scores are kept in a checkpoint")
     loaded = _checkpoint(ckpt, threads) if ckpt else None
     if loaded and str(loaded.training.get("task")).startswith("toy"):
+        if record:
+            raise click.UsageError("--record is for forecasts; a toy's divergences are printed only")
         found = evaluation.evaluate_toy_checkpoint(loaded)
         show_json(tables.toy_json(found)) if as_json else click.echo(tables.toy_text(found))
         return
@@ -233,7 +300,16 @@ def evaluate(
             scores = evaluation.evaluate_checkpoint(loaded, data, split, device=device, **common)
         else:
             scores = evaluation.evaluate_bundle(bundle, data, split, threads=threads, **common)
+    if ckpt and loaded and record:
+        _record(ckpt, loaded, scores.record())
     show_json(scores.as_dict()) if as_json else click.echo(tables.scores_text(scores))
+
+
+def _record(path: Path, checkpoint: "Checkpoint", scores: dict[str, Any]) -> None:
+    from hcnaf_export.checkpoint import save_checkpoint
+
+    state = checkpoint.model.state_dict()
+    save_checkpoint(path, checkpoint.config, state, checkpoint.training, {**checkpoint.scores, **scores})
 
 
 def _checkpoint(path: Path, threads: int | None) -> "Checkpoint":

@@ -11,12 +11,12 @@ from types import ModuleType
 from typing import Any, Literal
 
 import numpy as np
-from hcnaf_runtime.errors import DataError, MissingExtraError
-from hcnaf_runtime.scene import KINDS, Scene
 from numpy.typing import NDArray
 
 from hcnaf_export.data.argoverse2_map import CHANNELS, VectorMap, draw, read_map
 from hcnaf_export.data.resample import states
+from hcnaf_runtime.errors import DataError, MissingExtraError
+from hcnaf_runtime.scene import KINDS, Scene
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -6,10 +6,10 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from hcnaf_runtime.errors import DataError
 from numpy.typing import ArrayLike, NDArray
 
 from hcnaf_export.data.raster import Rasteriser
+from hcnaf_runtime.errors import DataError
 
 Array = NDArray[np.float64]
 
@@ -93,9 +93,7 @@ def draw(vector_map: VectorMap, low: ArrayLike, high: ArrayLike, resolution: flo
     corner, extent = np.asarray(low, dtype=np.float64), np.subtract(high, low)
     width, height = np.ceil(extent / resolution - 1e-6).astype(int)
     if max(width, height) > _PIXELS:
-        raise DataError(
-            f"map of {width} x {height} pixels; expected at most {_PIXELS}: choose a smaller radius"
-        )
+        raise DataError(f"map of {width} x {height} pixels; expected at most {_PIXELS}: choose a smaller radius")
     # Drawn about the window's corner: city coordinates run to kilometres.
     canvas = Rasteriser((0.0, 0.0), resolution, int(width), int(height))
     for area in vector_map.areas:

@@ -14,8 +14,9 @@ from os import PathLike
 from pathlib import Path
 
 import numpy as np
-from hcnaf_runtime.errors import DataError
 from numpy.typing import NDArray
+
+from hcnaf_runtime.errors import DataError
 
 Array = NDArray[np.float64]
 
@@ -114,9 +115,7 @@ def load(root: str | PathLike[str], recordings: Sequence[str] = RECORDINGS) -> W
     parts = [_none()] + [
         windows(read_recording(_find(Path(root), name)), RECORDINGS.index(name)) for name in recordings
     ]
-    merged = {
-        field: np.concatenate([getattr(part, field) for part in parts]) for field in Windows.__annotations__
-    }
+    merged = {field: np.concatenate([getattr(part, field) for part in parts]) for field in Windows.__annotations__}
     return Windows(**merged)
 
 
@@ -173,11 +172,7 @@ def _starts(linked: NDArray[np.bool_], length: int) -> NDArray[np.int64]:
     """Rows that begin a run of `length` rows, each linked to the next."""
     broken = np.concatenate([[0], np.cumsum(~linked)])
     last = len(broken) - length
-    return (
-        np.flatnonzero(broken[: last + 1] == broken[length - 1 :])
-        if last >= 0
-        else np.zeros(0, dtype=np.int64)
-    )
+    return np.flatnonzero(broken[: last + 1] == broken[length - 1 :]) if last >= 0 else np.zeros(0, dtype=np.int64)
 
 
 def _none() -> Windows:

@@ -15,11 +15,11 @@ from typing import Any, Literal
 
 import msgspec
 import numpy as np
-from hcnaf_runtime.errors import DataError
-from hcnaf_runtime.scene import KINDS, Scene
 from numpy.typing import NDArray
 
 from hcnaf_export.data.resample import headings, resample, speeds, states
+from hcnaf_runtime.errors import DataError
+from hcnaf_runtime.scene import KINDS, Scene
 
 Array = NDArray[np.float64]
 Targets = Literal["player", "all"]
@@ -175,9 +175,7 @@ def _yaws_now(episode: Episode) -> Array:
     yaw = np.arctan2(relative[:, 1, 0], relative[:, 0, 0])
     if episode.agent_yaws is not None:
         yaw = np.radians(episode.agent_yaws)
-    late = [
-        _is_late(*pair) for pair in zip(relative, episode.agent_pasts, episode.agent_futures, strict=True)
-    ]
+    late = [_is_late(*pair) for pair in zip(relative, episode.agent_pasts, episode.agent_futures, strict=True)]
     turn = [
         _last_turn(track[:, :2]) if is_late else 0.0
         for track, is_late in zip(episode.agent_pasts, late, strict=True)
@@ -215,9 +213,7 @@ def _decode(path: Path) -> dict[str, Any]:
     try:
         record = msgspec.json.decode(path.read_bytes())
     except OSError as error:
-        raise DataError(
-            f"{path}: cannot be read ({error.strerror}); expected a PRECOG-CARLA JSON file"
-        ) from error
+        raise DataError(f"{path}: cannot be read ({error.strerror}); expected a PRECOG-CARLA JSON file") from error
     except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
         raise DataError(f"{path}: not valid JSON ({error}); expected a PRECOG-CARLA episode") from error
     if not isinstance(record, dict):
@@ -230,15 +226,11 @@ def _decode(path: Path) -> dict[str, Any]:
 def _field(record: dict[str, Any], name: str, shape: tuple[int | None, ...]) -> Array:
     expected = "[" + ", ".join("any" if n is None else str(n) for n in shape) + "]"
     if name not in record:
-        raise DataError(
-            f"episode without `{name}`; expected numbers {expected}: is this a PRECOG-CARLA file?"
-        )
+        raise DataError(f"episode without `{name}`; expected numbers {expected}: is this a PRECOG-CARLA file?")
     try:
         array = np.asarray(record[name], dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise DataError(
-            f"episode with a `{name}` that is no array of numbers; expected {expected}"
-        ) from error
+        raise DataError(f"episode with a `{name}` that is no array of numbers; expected {expected}") from error
     if array.size == 0 and shape[0] is None:
         array = array.reshape(0, *(n or 0 for n in shape[1:]))
     if array.ndim != len(shape) or any(n not in (None, m) for n, m in zip(shape, array.shape, strict=True)):
@@ -258,9 +250,7 @@ def _pose(record: dict[str, Any], name: str) -> Array:
 def _lidar(record: dict[str, Any]) -> tuple[float, float]:
     """Pixels per metre and half width (m) of the overhead features, checked before they size anything."""
     found = record.get("lidar_params")
-    values = (
-        [found.get(key) for key in ("pixels_per_meter", "meters_max")] if isinstance(found, dict) else [None]
-    )
+    values = [found.get(key) for key in ("pixels_per_meter", "meters_max")] if isinstance(found, dict) else [None]
     numbers = [v for v in values if isinstance(v, int | float) and not isinstance(v, bool) and 0 < v <= 1000]
     if len(numbers) != 2:
         raise DataError(

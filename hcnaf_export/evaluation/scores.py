@@ -55,6 +55,21 @@ class Scores(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         plain: dict[str, Any] = msgspec.to_builtins(self)
         return plain
 
+    def record(self) -> dict[str, Any]:
+        """What a checkpoint keeps of it: columns by horizon, and what they rest on."""
+
+        def column(field: str, mean: float | None = None) -> dict[str, float]:
+            values = {f"{r.horizon:g} s": float(getattr(r, field)) for r in self.rows}
+            return values if mean is None else values | {"mean": mean}
+
+        return {
+            f"{self.split} NLL (nats/m²)": column("nll", self.mean),
+            f"{self.split} standard error": column("error", self.mean_error),
+            f"{self.split} constant velocity": column("baseline"),
+            f"{self.split} windows": self.windows,
+            f"{self.split} floor of the label noise": self.floor,
+        }
+
     def table(self) -> list[tuple[str, ...]]:
         """Header and rows of text, one row per horizon: NLLs and gain with their standard errors."""
         head = ("horizon (s)", "NLL (nats/m²)", "constant velocity", "gain")

@@ -81,9 +81,10 @@ def run_training(
         TrainingError: training diverged.
     """
     place = _device(device)
-    prepare(out, resume)
+    check_target(out, resume)
     with _threads(threads):
         task = make_task(recipe, data, place)
+        out.mkdir(parents=True, exist_ok=True)  # only now: bad data leaves no directory behind
         state = RunState.start(_fresh(recipe).to(place), recipe.optimiser)
         if resume:
             state.restore(out / "checkpoint.pt", recipe)
@@ -106,15 +107,14 @@ def make_task(recipe: Recipe, data: Path | None, device: torch.device) -> PomTas
     return PomTask(recipe, data, device)
 
 
-def prepare(out: Path, resume: bool) -> None:
-    """Make the run directory, or see that there is something to resume. Raises CheckpointError."""
+def check_target(out: Path, resume: bool) -> None:
+    """See that the run directory is free, or that there is something to resume. Raises CheckpointError."""
     if resume:
         if not (out / "checkpoint.pt").is_file():
             raise CheckpointError(f"{out} has no checkpoint.pt to resume from; start the run without resume")
         return
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise CheckpointError(f"{out} is not empty; resume it, or choose a new directory")
-    out.mkdir(parents=True, exist_ok=True)
 
 
 def _fresh(recipe: Recipe) -> Hcnaf:

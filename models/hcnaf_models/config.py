@@ -48,6 +48,8 @@ class ConditionConfig:
     Args:
         hidden: widths of the hidden layers; the last one is the rank of the head. () is linear in the condition.
         location, scale: units of the flow, one number for all dimensions.
+        examples: conditions it is meant for, each of `size` numbers. Exports are checked at these and between
+            them; far from them an MLP may emit anything.
     """
 
     flow: FlowSpec = field(default_factory=FlowSpec)
@@ -56,7 +58,12 @@ class ConditionConfig:
     hidden: tuple[int, ...] = (64,)
     location: float = 0.0
     scale: float = 1.0
+    examples: tuple[tuple[float, ...], ...] = ()
     kind: Literal["condition"] = "condition"
+
+    def __post_init__(self) -> None:
+        if any(len(example) != self.size for example in self.examples):
+            raise ValueError(f"examples of a condition must have {self.size} numbers each")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,5 +137,10 @@ def _build(cls: type[Any], data: dict[str, Any]) -> Any:
     for key, value in data.items():
         if key in nested and isinstance(value, dict):
             value = _build(nested[key], value)
-        values[key] = tuple(value) if isinstance(value, list) else value
+        values[key] = _frozen(value)
     return cls(**values)
+
+
+def _frozen(value: Any) -> Any:
+    """Lists as tuples, all the way down."""
+    return tuple(_frozen(v) for v in value) if isinstance(value, (list, tuple)) else value

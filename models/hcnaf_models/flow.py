@@ -119,12 +119,17 @@ def strictly_lower(spec: FlowSpec, lower: Tensor) -> Tensor:
 
 
 def _damp(u: Tensor, a: Tensor, log_scale: Tensor | float = 0.0) -> tuple[Tensor, Tensor]:
-    """u * tanh'(a) as (tangent, log-scale): tanh' = 4 e / (1 + e)^2, e = exp(-2|a|), with the slowest decay
-    of each point taken out into the log-scale, so that far from the data nothing underflows."""
+    """u * tanh'(a) as (tangent, log-scale), the tangent's largest entry being 1.
+
+    tanh' = 4 e / (1 + e)^2 with e = exp(-2|a|). The slowest decay of each point is taken out first, so that far
+    from the data nothing underflows before it is scaled. Scales are constants to the gradient: they cancel.
+    """
     size = torch.abs(a)
     least = size.amin(dim=-1, keepdim=True).detach()
     e = torch.exp(-2.0 * size)
-    return u * torch.exp(-2.0 * (size - least)) * (4.0 / (1.0 + e) ** 2), log_scale - 2.0 * least
+    t = u * torch.exp(-2.0 * (size - least)) * (4.0 / (1.0 + e) ** 2)
+    largest = torch.clamp(t.amax(dim=-1, keepdim=True).detach(), min=1.2e-38)
+    return t / largest, log_scale - 2.0 * least + torch.log(largest)
 
 
 def _points(v: Tensor) -> Tensor:

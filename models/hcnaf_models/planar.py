@@ -6,9 +6,9 @@ r"""Exact distribution functions of a two-dimensional flow (a Knothe-Rosenblatt 
 Everything that depends on x alone (dimension 1, and its context for dimension 2) is computed once per x and
 broadcast over y. `normalised` support uses the formulas above, `paper` support Phi alone.
 
-Written for the graphs that ship, where this is the hot path. Arrays over y are [B, S, H, E], one small product
-per x; the limits z_2(-), z_2(+) ride along as the images of y = -+`FAR`; and for narrow layers the context of an x
-is one more column of the weights, met by a unit that is always 1, which saves a pass over [B, S, H, E] per layer.
+Written for the graphs that ship, where this is the hot path: arrays over y are [B, S, H, E], one product per x
+with its context broadcast along contiguous memory, and the limits z_2(-), z_2(+) ride along as images of
+y = -+`FAR`.
 """
 
 from __future__ import annotations
@@ -19,20 +19,24 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from hcnaf_models.normal import cdf, interval_fraction
+from hcnaf_models.normal import cdf, erf_fraction, interval_fraction
 from hcnaf_models.spec import FlowSpec
 
-Fraction = Callable[[Tensor, Tensor, Tensor], Tensor]
-"""(Phi(z) - Phi(a)) / (Phi(b) - Phi(a)) of z, a, b."""
+Fraction = Callable[[Tensor], Tensor]
+"""F [..., E] from z [..., E], whose last two entries are its limits z(-) and z(+), where F is 0 and 1."""
 
 FAR = 1e30
 """A y (or x) whose first-layer units are all saturated, in either direction."""
 
-SURE = 20.0
-"""tanh(20) is 1 in float32 and within 1e-17 of it in float64: the argument of the unit that is always 1."""
 
-NARROW = 48
-"""Up to this many hidden units contexts go into the weights; beyond, copying the weights costs more."""
+def stable_fraction(z: Tensor) -> Tensor:
+    """The truncated normal's distribution function, relatively accurate however far out the limits are."""
+    return interval_fraction(z, z[..., -2:-1], z[..., -1:])
+
+
+def fast_fraction(z: Tensor) -> Tensor:
+    """The same by erf alone, good to about 1e-7 / (Phi(z(+)) - Phi(z(-)))."""
+    return erf_fraction(z, z[..., -2:-1], z[..., -1:])
 
 
 class PlanarLayer(NamedTuple):
@@ -45,7 +49,7 @@ class PlanarLayer(NamedTuple):
     B_2: Tensor
 
 
-def marginal_cdf(spec: FlowSpec, theta: Tensor, x: Tensor, fraction: Fraction = interval_fraction) -> Tensor:
+def marginal_cdf(spec: FlowSpec, theta: Tensor, x: Tensor, fraction: Fraction = stable_fraction) -> Tensor:
     """F_1 at x [B, K] under theta [B, P]: [B, K]."""
     location, _, stack = cut(spec, theta)
     u = torch.cat([x - location, *_infinities(x)], dim=-1).unsqueeze(-2)
@@ -56,23 +60,22 @@ def marginal_cdf(spec: FlowSpec, theta: Tensor, x: Tensor, fraction: Fraction = 
 
 
 def conditional_cdf(
-    spec: FlowSpec, theta: Tensor, x: Tensor, y: Tensor, fraction: Fraction = interval_fraction
+    spec: FlowSpec, theta: Tensor, x: Tensor, y: Tensor, fraction: Fraction = stable_fraction
 ) -> Tensor:
     """F_2(y | x) at x [B, S] and y [B, S, E] or [B, 1, E] under theta [B, P]: [B, S, E]."""
     m_1, m_2, stack = cut(spec, theta)
     v = y - m_2.unsqueeze(-1)
     h = torch.cat([v, *_infinities(v)], dim=-1).unsqueeze(-2)  # [B, S or 1, 1, E + 2]
-    if spec.hidden <= NARROW:
-        h = torch.cat([h, torch.ones_like(h)], dim=-2)
     contexts = second_contexts(stack, (x - m_1).unsqueeze(-2))
-    for layer, c in zip(stack[:-1], contexts[:-1], strict=True):
-        h = torch.tanh(_advance(spec, layer.W_22, c, h, carry=True))
-    z = _advance(spec, stack[-1].W_22, contexts[-1], h, carry=False).squeeze(-2)
+    h = torch.tanh(stack[0].W_22.unsqueeze(1) * h + _columns(contexts[0]))
+    for layer, c in zip(stack[1:-1], contexts[1:-1], strict=True):
+        h = torch.tanh(layer.W_22.unsqueeze(1) @ h + _columns(c))
+    z = (stack[-1].W_22.unsqueeze(1) @ h + _columns(contexts[-1])).squeeze(-2)
     return _distribution(spec, z, fraction)
 
 
 def cell_mass(
-    spec: FlowSpec, theta: Tensor, x: Tensor, weight: Tensor, y: Tensor, fraction: Fraction = interval_fraction
+    spec: FlowSpec, theta: Tensor, x: Tensor, weight: Tensor, y: Tensor, fraction: Fraction = stable_fraction
 ) -> Tensor:
     """Masses of cells: sum_s weight_cs (F_2(y_{j+1} | x_s) - F_2(y_j | x_s)), [B, E - 1, C].
 
@@ -81,7 +84,7 @@ def cell_mass(
         x: [B, S], nodes (m).
         weight: [B, C, S], what node s counts for in column c; a column's weights sum to its increment of F_1.
         y: [B, E], cell edges, ascending (m).
-        fraction: how F_2 is computed from z_2 and its limits.
+        fraction: how F_2 follows from z_2 and its limits.
     """
     F = conditional_cdf(spec, theta, x, y.unsqueeze(-2), fraction)
     increments = torch.clamp(F[..., 1:] - F[..., :-1], min=0.0)  # [B, S, E - 1]
@@ -108,27 +111,14 @@ def second_contexts(stack: list[PlanarLayer], u: Tensor) -> list[Tensor]:
     return [*contexts, stack[-1].W_21 @ u + stack[-1].B_2]
 
 
-def _advance(spec: FlowSpec, W: Tensor, c: Tensor, h: Tensor, *, carry: bool) -> Tensor:
-    """W h_s + c_s for every x_s: W [B, H_out, H_in], c [B, H_out, S], h [B, S, H_in, E] -> [B, S, H_out, E].
-
-    For narrow layers h ends with the unit that is always 1, and so does the result if `carry`.
-    """
-    columns = c.transpose(-1, -2).unsqueeze(-1)  # [B, S, H_out, 1]
-    if spec.hidden > NARROW:
-        return W.unsqueeze(1) @ h + columns
-    if carry:
-        W = torch.nn.functional.pad(W, (0, 0, 0, 1))
-        columns = torch.nn.functional.pad(columns, (0, 0, 0, 1), value=SURE)
-    W = W.unsqueeze(1).expand(-1, c.shape[-1], -1, -1)
-    return torch.cat([W, columns], dim=-1) @ h
+def _columns(c: Tensor) -> Tensor:
+    """Contexts [B, H, S] as [B, S, H, 1], to be added along y."""
+    return c.transpose(-1, -2).unsqueeze(-1)
 
 
 def _distribution(spec: FlowSpec, z: Tensor, fraction: Fraction) -> Tensor:
-    """F [..., E] from z [..., E + 2], whose last two entries are its limits z(-) and z(+)."""
-    inner = z[..., :-2]
-    if spec.support == "paper":
-        return cdf(inner)
-    return fraction(inner, z[..., -2:-1], z[..., -1:])
+    """F [..., E] from z [..., E + 2], which ends with its limits."""
+    return cdf(z[..., :-2]) if spec.support == "paper" else fraction(z)[..., :-2]
 
 
 def _infinities(v: Tensor) -> tuple[Tensor, Tensor]:

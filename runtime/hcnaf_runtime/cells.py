@@ -7,10 +7,11 @@ The mass of the cell [x_a, x_b] x [y_a, y_b] is
 exact in y, a quadrature in x (see `quadrature`). A column's cells telescope to its increment of F_1 times
 what F_2 leaves inside the window, whatever the quadrature, so a map never loses or invents mass.
 
-    F_1 at all edges --> columns that hold mass --> one node in each (Halo) --> columns in doubt --> more nodes (RULES)
+    F_1 at all edges --> columns with mass --> one node in each (Halo) --> columns in doubt --> more nodes (RULES)
 
-Columns of all maps are pooled in tiles. In a tile only the rows are computed where F_2 changes: it is monotone in y,
-so a few landmarks bound exactly what lies outside them. What is left out is therefore known: it is the certificate.
+Columns of all maps are pooled in tiles. In a tile only the rows are computed where F_2 changes, found at a few
+landmarks; the rows left out below and above are one tall cell each, whose masses come out with the others.
+So what is left out is known exactly, since F_2 is monotone: it is the certificate.
 """
 
 from collections.abc import Iterator
@@ -47,11 +48,14 @@ RESOLVED = 1e-3
 """A rule's nodes may miss F_1 by this share of a column's mass. A spike between two nodes misses it by far
 more, and would otherwise pass for converged, since no rule sees it; accuracy itself is judged by the cells."""
 
-LANDMARKS = 16
-"""At about so many rows F_2 is looked at first."""
+LANDMARKS = 32
+"""At about so many rows F_2 is looked at first,"""
 
-CHUNK = 1 << 18
-"""Numbers in the widest intermediate of a graph run, nodes x edges x hidden units: 1 MiB stays in cache."""
+SCOUTS = 4
+"""and only at every so many-th node. What that overlooks is found when the cells are computed, and mended."""
+
+CHUNK = 1 << 19
+"""Numbers in the widest intermediate of a graph run, nodes x edges x hidden units: 2 MiB."""
 
 
 class Distribution(Protocol):
@@ -78,6 +82,11 @@ class Window:
     x: Float32
     y: Float32
 
+    def strips(self, most: int) -> Iterator["Window"]:
+        """The window from left to right in parts of at most about `most` cells."""
+        width = max(1, most // (len(self.y) - 1))
+        return (Window(self.x[c : c + width + 1], self.y) for c in range(0, len(self.x) - 1, width))
+
 
 @dataclass(frozen=True)
 class Cells:
@@ -88,7 +97,7 @@ class Cells:
     error: Float64
     """[B]: what the quadrature may miss in the worst cell, as far as refinement can tell."""
     lost: Float64
-    """[B]: the mass inside the window that was left out; at most `lost_mass`."""
+    """[B]: a bound on the mass inside the window that was left out, itself at most `lost_mass`."""
 
 
 def masses(
@@ -101,8 +110,8 @@ def masses(
 ) -> Cells:
     """The mass of every cell.
 
-    A column is refined until its cells change by less than `tolerance`. Columns and rows are left out while what they
-    hold stays below `lost_mass` per map; with 0 only what float32 cannot tell from nothing. Memory beyond
+    A column is refined until its cells change by less than `tolerance`. Columns and rows are left out while what
+    they hold stays below `lost_mass` per map; with 0 only what float32 cannot tell from nothing. Memory beyond
     the result is bounded by `chunk`, whatever the size of the window and the number of maps.
     """
     return _Filling(flow, theta, window, tolerance, lost_mass, chunk).run()
@@ -116,14 +125,14 @@ class _Filling:
     ) -> None:
         self.flow, self.theta, self.window, self.chunk = flow, theta, window, chunk
         rows = len(window.y) - 1
-        # Each end of a tile's columns may lose a fifth, the columns left out a half: together below lost_mass.
+        # Either end of a tile's columns may lose a fifth, the columns left out a half: together below lost_mass.
         self.ends = max(lost_mass / 5.0, SATURATED[0]), max(lost_mass / 5.0, SATURATED[1])
         self.marks = np.append(np.arange(0, rows, max(1, rows // LANDMARKS)), rows)
         self.share = self._shares()
         self.kept = _kept(self.share, lost_mass / 2.0)
         self.mass = np.zeros((len(theta), rows, len(window.x) - 1), np.float32)
         self.error = np.where(self.kept, 0.0, self.share if lost_mass == 0.0 else 0.0)
-        self.lost = np.where(self.kept, 0.0, self.share).sum(axis=1)
+        self.outside = np.where(self.kept, 0.0, self.share)  # [B, C]: what is left out of each column
         self.goal = np.maximum(tolerance, _noise(window.x) * self.share)
 
     def run(self) -> Cells:
@@ -135,7 +144,7 @@ class _Filling:
             self._refine(rule, pending)
             pending &= self.error > self.goal
         np.maximum(self.mass, 0.0, out=self.mass)
-        return Cells(self.mass, self.error.max(axis=1), self.lost)
+        return Cells(self.mass, self.error.max(axis=1), self.outside.sum(axis=1))
 
     def _shares(self) -> Float64:
         """Increments of F_1 [B, C]."""
@@ -153,7 +162,7 @@ class _Filling:
         reach, C = HALO.reach, len(self.window.x) - 1
         pitch = (float(self.window.x[-1]) - float(self.window.x[0])) / C
         tiles = cut(self.kept, WIDTH, gap=2 * reach)
-        for some in batches(tiles.count, np.ones_like(tiles.count), self._budget(len(self.marks))):
+        for some in batches(tiles.count, np.ones_like(tiles.count), self._budget(1 + len(self.marks) // SCOUTS)):
             tile = tiles.some(some)
             w = tile.columns.shape[1]
             weights, misfit = self._weights(tile, HALO.rule)
@@ -176,7 +185,8 @@ class _Filling:
     def _refine(self, rule: Rule, pending: Mask) -> None:
         """Several nodes in each of the columns pending [B, C], judged by what changes."""
         tiles = cut(pending, max(1, WIDTH // rule.size))
-        for some in batches(tiles.count * rule.size, np.ones_like(tiles.count), self._budget(len(self.marks))):
+        sizes = tiles.count * rule.size
+        for some in batches(sizes, np.ones_like(sizes), self._budget(1 + len(self.marks) // SCOUTS)):
             tile = tiles.some(some)
             J, w = tile.columns.shape
             weights, misfit = self._weights(tile, rule)
@@ -219,33 +229,53 @@ class _Filling:
     def _blocks(self, tile: Tiles, x: Float32, weight: Float32) -> Iterator[tuple[int, slice, Float32]]:
         """Of each tile the rows that hold anything, and what weight [J, n, S] makes of them: [rows, n]."""
         low, high = self._rows(tile, x, weight)
-        tall = max(1, self.chunk // (self.flow.hidden * x.shape[1]) - 3)
-        pieces = -(-(high - low) // tall)
-        owner = np.repeat(np.arange(len(tile)), pieces)
+        yield from self._evaluate(tile, x, weight, low, high)
+        maps = tile.maps[:, None]
+        allowed = sum(self.ends) * self.share[maps, tile.columns]
+        missed = ((self.outside[maps, tile.columns] > allowed + 1e-9) & tile.own).any(axis=1)
+        again = np.flatnonzero(missed & (high - low < len(self.window.y) - 1))
+        if len(again):
+            low[again], high[again] = 0, len(self.window.y) - 1
+            yield from self._evaluate(tile, x, weight, low, high, again)
+
+    def _evaluate(
+        self, tile: Tiles, x: Float32, weight: Float32, low: Indices, high: Indices, of: Indices | None = None
+    ) -> Iterator[tuple[int, slice, Float32]]:
+        """Rows `low` to `high` [J] of the tiles `of` (all by default), noting what is outside them."""
+        which = np.arange(len(tile)) if of is None else of
+        self.outside[tile.maps[which, None], tile.columns[which]] = 0.0
+        tall = max(1, self.chunk // (self.flow.hidden * x.shape[1]) - 5)
+        pieces = np.maximum(-(-(high - low)[which] // tall), 1)
+        owner = np.repeat(which, pieces)
         rank = np.arange(len(owner)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
         start = low[owner] + rank * tall
         stop = np.minimum(start + tall, high[owner])
-        ones = np.ones_like(start)
-        for some in batches(stop - start + 3, ones, self._budget(x.shape[1])):
-            which, first, last = owner[some], start[some], stop[some]
-            rows = np.minimum(first[:, None] + np.arange((last - first).max() + 1), last[:, None])
-            out = self.flow.cell_mass(self.theta[tile.maps[which]], x[which], weight[which], self.window.y[rows])
-            for i, j in enumerate(which):
-                yield int(j), slice(int(first[i]), int(last[i])), out[i, : last[i] - first[i]]
+        below = np.where(rank == 0, 0, start)
+        above = np.where(stop == high[owner], len(self.window.y) - 1, stop)
+        for some in batches(stop - start + 5, np.ones_like(start), self._budget(x.shape[1])):
+            j, first, last = owner[some], start[some], stop[some]
+            middle = np.minimum(first[:, None] + np.arange((last - first).max() + 1), last[:, None])
+            rows = np.concatenate([below[some, None], middle, above[some, None]], axis=1)
+            out = self.flow.cell_mass(self.theta[tile.maps[j]], x[j], weight[j], self.window.y[rows])
+            for i, owned in enumerate(j):
+                self._note(tile, owned, out[i, 0] + out[i, -1])
+                yield int(owned), slice(int(first[i]), int(last[i])), out[i, 1 : 1 + last[i] - first[i]]
+
+    def _note(self, tile: Tiles, j: int, outside: Float32) -> None:
+        n = tile.count[j]
+        self.outside[tile.maps[j], tile.columns[j, :n]] += np.maximum(outside[:n], 0.0)
 
     def _rows(self, tile: Tiles, x: Float32, weight: Float32) -> tuple[Indices, Indices]:
-        """First and last + 1 row [J] outside which there is nothing, and the certificate for it."""
-        y = np.broadcast_to(self.window.y[self.marks], (*x.shape, len(self.marks)))
-        cdf = self.flow.conditional_cdf(self.theta[tile.maps], x, y)
-        used = (weight[:, : tile.columns.shape[1]] != 0.0).any(axis=1)[..., None]  # padding decides nothing
-        empty = np.count_nonzero(((cdf <= cdf[..., :1] + self.ends[0]) | ~used).all(axis=1), axis=1)
-        full = np.count_nonzero(((cdf >= cdf[..., -1:] - self.ends[1]) | ~used).all(axis=1), axis=1)
+        """First and last + 1 row [J] outside which there should be nothing, by every SCOUTS-th node."""
+        scouts = np.append(np.arange(0, x.shape[1] - 1, SCOUTS), x.shape[1] - 1)
+        y = np.broadcast_to(self.window.y[self.marks], (len(x), len(scouts), len(self.marks)))
+        cdf = self.flow.conditional_cdf(self.theta[tile.maps], x[:, scouts], y)
+        w = tile.columns.shape[1]
+        unused = (weight[:, :w, scouts] == 0.0).all(axis=1)[..., None]  # padding decides nothing
+        empty = np.count_nonzero(((cdf <= cdf[..., :1] + self.ends[0]) | unused).all(axis=1), axis=1)
+        full = np.count_nonzero(((cdf >= cdf[..., -1:] - self.ends[1]) | unused).all(axis=1), axis=1)
         low = np.maximum(empty - 1, 0)
         high = np.maximum(np.minimum(len(self.marks) - full, len(self.marks) - 1), low)
-        j = np.arange(len(tile))
-        outside = (cdf[j, :, low] - cdf[..., 0]) + (cdf[..., -1] - cdf[j, :, high])  # [J, S]
-        lost = np.einsum("jcs,js->j", weight[:, : tile.columns.shape[1]], outside, dtype=np.float64)
-        np.add.at(self.lost, tile.maps, np.maximum(lost, 0.0))
         return self.marks[low], self.marks[high]
 
     def _budget(self, other: int) -> int:

@@ -107,4 +107,5 @@ class Grid:
 
 def _edges(origin: float, count: int, resolution: float) -> Float32:
     # From the origin each time, in float64: the same edge is the same float32 in every grid that shares it.
-    return (origin + np.arange(count + 1) * resolution).astype(np.float32)
+    with np.errstate(over="ignore"):  # what overflows is refused by the check that follows
+        return (origin + np.arange(count + 1) * resolution).astype(np.float32)

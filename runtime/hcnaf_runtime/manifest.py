@@ -18,8 +18,11 @@ OLDEST_FORMAT = 1
 """The oldest format this release reads."""
 FILE = "manifest.json"
 
-GraphName = Literal["hypernet", "flow", "marginal_cdf", "conditional_cdf", "cell_mass"]
-"""The graphs a bundle may hold; the last three exist for two-dimensional flows only."""
+GraphName = Literal["hypernet", "flow", "marginal_cdf", "conditional_cdf", "cell_mass", "forecast"]
+"""The graphs a bundle may hold; the last four exist for two-dimensional flows only, `forecast` for scenes only."""
+
+Precision = Literal["fp32", "fp16", "int8"]
+"""What the hyper-network's weights are stored as; the flow is always float32."""
 
 _PLAIN_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 _MAX_BYTES = 16 << 20
@@ -140,6 +143,9 @@ class Manifest(_Strict, frozen=True, kw_only=True):
     parity: list[ParityRow] = []
     training: dict[str, Any] = {}
     scores: dict[str, Any] = {}
+    precision: Precision = "fp32"
+    precision_cost: dict[str, Any] = {}
+    """What a precision below fp32 costs in nats, cell mass and total variation, and saves in bytes."""
 
     def __post_init__(self) -> None:
         if self.kind == "pom" and (self.scene is None or self.horizons is None):

@@ -21,6 +21,7 @@ SAVED = (
     "frame",
     "window_mass",
     "quadrature_error",
+    "lost_mass",
 )
 """The fields of forecast.npz."""
 
@@ -55,6 +56,8 @@ class Maps:
     """[A, T]: the probability inside the grid."""
     quadrature_error: Float64
     """[A, T]: the largest change of a cell in the last refinement."""
+    lost_mass: Float64
+    """[A, T]: the certificate: at most so much was left out of the window's cells."""
     notes: tuple[str, ...]
     """What was assumed, such as an absent optional raster channel."""
     timings: Timings
@@ -62,6 +65,12 @@ class Maps:
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the fields SAVED as an .npz file; either all of it appears or nothing does."""
         write_npz(path, {name: getattr(self, name) for name in SAVED})
+
+    def sparse(self, agent: int, horizon: int) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp], Float32]:
+        """Rows, columns and masses of the cells that hold anything, [n] each; by position in A and T."""
+        mass = self.mass[agent, horizon]
+        rows, columns = np.nonzero(mass)
+        return rows, columns, mass[rows, columns]
 
     def peak(self, agent: int, horizon: int) -> tuple[float, float, float]:
         """x, y (m, in `frame`) of the most probable cell's centre and its mass; by position in A and T."""

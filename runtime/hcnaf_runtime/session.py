@@ -63,7 +63,7 @@ def _options(onnxruntime: Any, threads: int) -> Any:
     options.log_severity_level = 3  # errors only: everything that matters is raised
     # Threads that spin between calls take the CPU from whatever else runs on the vehicle.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    options.add_session_config_entry("session.set_denormal_as_zero", "1")
+    # Denormals stay: flushing them would outlive the session in the calling thread, for all it computes.
     return options
 
 

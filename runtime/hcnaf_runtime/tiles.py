@@ -1,7 +1,8 @@
 """Cutting the columns of many maps into tiles, and tiles into batches that a graph runs at once.
 
-A tile is a few columns of one map. Tiles of all maps are pooled, so that a batch is full whether it comes from one
-wide map or from twenty narrow ones. Inside a batch everything is padded to the widest; what is padded weighs nothing.
+A tile is a few columns of one map. Tiles of all maps are pooled, so that a batch is full whether it comes from
+one wide map or from twenty narrow ones. Inside a batch everything is padded to the widest; what is padded
+weighs nothing.
 """
 
 from collections.abc import Iterator

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hcnaf_runtime.errors import DataError, MissingExtraError
-from hcnaf_runtime.scene import KINDS, Scene
 
 from hcnaf_export.data.argoverse2 import OBJECTS, convert_argoverse2, read_scenario, to_scene
 from hcnaf_export.data.argoverse2_map import CHANNELS
+from hcnaf_runtime.errors import DataError, MissingExtraError
+from hcnaf_runtime.scene import KINDS, Scene
 
 pyarrow = pytest.importorskip("pyarrow", reason="pyarrow (extra data) is not installed")
 parquet = pytest.importorskip("pyarrow.parquet", reason="pyarrow (extra data) is not installed")
@@ -70,9 +70,7 @@ MAP = {
 }
 
 
-def write(
-    folder: Path, tracks: list[list[dict]] = TRACKS, vector_map: object = MAP, name: str = "a1"
-) -> Path:
+def write(folder: Path, tracks: list[list[dict]] = TRACKS, vector_map: object = MAP, name: str = "a1") -> Path:
     rows = [row for one in tracks for row in one]
     path = folder / f"scenario_{name}.parquet"
     parquet.write_table(pyarrow.Table.from_pylist(rows), path)

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hcnaf_runtime.errors import DataError
 
 from hcnaf_export.data import eth_ucy
+from hcnaf_runtime.errors import DataError
 
 DATA = Path(__file__).parents[2] / ".." / "shared" / "data" / "eth_ucy"
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="the ETH/UCY recordings are not in ../shared/data")
@@ -15,9 +15,7 @@ needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="the ETH/UCY recording
 
 def walk(pedestrian: int, start: int, count: int, speed: float = 0.5) -> np.ndarray:
     frame = start + 10.0 * np.arange(count)
-    return np.stack(
-        [frame, np.full(count, pedestrian), speed * frame / 10.0, np.full(count, pedestrian)], axis=1
-    )
+    return np.stack([frame, np.full(count, pedestrian), speed * frame / 10.0, np.full(count, pedestrian)], axis=1)
 
 
 def write(folder: Path, rows: np.ndarray) -> None:

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hcnaf_runtime.errors import DataError, SceneError
-from hcnaf_runtime.scene import Scene
 
 from hcnaf_export.data.precog import LIDAR_CHANNELS, convert_precog, read_episode, to_scene
 from hcnaf_export.data.resample import headings, resample, speeds
+from hcnaf_runtime.errors import DataError, SceneError
+from hcnaf_runtime.scene import Scene
 
 GENUINE = Path(__file__).parents[2] / ".." / "shared" / "data" / "precog_carla" / "ma_datum_00000000.json"
 needs_data = pytest.mark.skipif(not GENUINE.is_file(), reason="no PRECOG-CARLA episode in ../shared/data")
@@ -243,8 +243,7 @@ def test_genuine_cars_reflect_the_lidar():
     points = scene.origin + scene.resolution * (np.stack([col, row], axis=1) + 0.5)
     cars = scene.past[1:4, -1, :2]
     hits, mirrored = (
-        (np.linalg.norm(points[:, None] - cars * [1.0, sign], axis=2) < 3.5).sum(axis=0)
-        for sign in (1.0, -1.0)
+        (np.linalg.norm(points[:, None] - cars * [1.0, sign], axis=2) < 3.5).sum(axis=0) for sign in (1.0, -1.0)
     )
     assert (hits >= 5).all()
     assert hits.sum() > 2 * mirrored.sum()

@@ -5,11 +5,11 @@ from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
-from hcnaf_runtime.scene import Scene
 
 from hcnaf_export.data.argoverse2 import OBJECTS
 from hcnaf_export.data.precog import LIDAR_CHANNELS
 from hcnaf_export.data.raster import MAP_CHANNELS
+from hcnaf_runtime.scene import Scene
 
 DOC = (Path(__file__).parents[2] / "docs" / "scene.md").read_text(encoding="utf-8")
 

@@ -47,7 +47,7 @@ def test_a_bundle_opens_and_verifies(pom, line, space):
 def test_files_of_a_bundle(pom, line):
     flow_only = {"hypernet.onnx", "flow.onnx", "golden.npz", "manifest.json", "README.md"}
     assert {f.name for f in line.path.iterdir()} == flow_only
-    planar_graphs = {"marginal_cdf.onnx", "conditional_cdf.onnx", "cell_mass.onnx"}
+    planar_graphs = {"marginal_cdf.onnx", "conditional_cdf.onnx", "cell_mass.onnx", "forecast.onnx"}
     assert {f.name for f in pom.path.iterdir()} == flow_only | planar_graphs
     assert pom.result.bytes == sum(f.stat().st_size for f in pom.path.iterdir())
     assert list(pom.path.parent.iterdir()) == [pom.path]

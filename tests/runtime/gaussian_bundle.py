@@ -57,7 +57,8 @@ GRAPHS = {
     "conditional_cdf": f"""g (float[B,P] theta, float[B,S] x, float[B,S,E] y) => (float[B,S,E] cdf) {{
     {_PARTS}{_CONDITIONAL}
     dy = Sub(y, m2e) {_phi("dy", "s2e", "cdf")} }}""",
-    "cell_mass": f"""g (float[B,P] theta, float[B,S] x, float[B,C,S] weight, float[B,E] y) => (float[B,R,C] mass) {{
+    "cell_mass": f"""g (float[B,P] theta, float[B,S] x, float[B,C,S] weight, float[B,E] y)
+    => (float[B,R,C] mass) {{
     {_PARTS}{_CONDITIONAL}
     middle = Constant<value_ints = [1]>()
     rows = Unsqueeze(y, middle)

@@ -256,3 +256,41 @@ def test_conditions_and_scenes_are_not_confused(condition_path, forecaster, scen
         toy.pom(Condition(np.zeros((1, 5), np.float32)), horizons=[1.0])
     with pytest.raises(InputError, match="a condition has none"):
         toy.pom(Condition(np.zeros((1, 5), np.float32)), frame="scene")
+
+
+def test_cdf_at_points_is_the_mass_below_them(forecaster, scene):
+    """F_1 against the mass left of a point, F_2 against that of its column below it."""
+    grid = Grid(200, 200, 0.5).ahead()
+    maps = forecaster.pom(scene, grid, horizons=[2.0])
+    x, y = grid.x_edges[90], grid.y_edges[104]
+    F = forecaster.cdf(scene, np.float32([[x, y]]), horizons=[2.0])
+    assert F.shape == (*maps.mass.shape[:2], 1, 2)
+    for a in range(len(maps.agents)):
+        left = maps.mass[a, 0, :, :90].sum(dtype=np.float64)
+        assert F[a, 0, 0, 0] == pytest.approx(left, abs=2e-4)
+        middle = (x + grid.x_edges[91]) / 2
+        column = maps.mass[a, 0, :, 90]
+        below = forecaster.cdf(scene, np.float32([[middle, y]]), horizons=[2.0])[a, 0, 0, 1]
+        if column.sum() > 1e-3:
+            assert below == pytest.approx(column[:104].sum() / column.sum(), abs=0.02)
+
+
+@pytest.mark.parametrize("lost_mass", [1e-2, 1e-4, 1e-6])
+@pytest.mark.parametrize("frame", ["agent", "scene"])
+def test_a_certified_map_misses_no_more_than_it_says(forecaster, scene, lost_mass, frame):
+    dense = forecaster.pom(scene, horizons=[0.5, 2.0], frame=frame)
+    sparse = forecaster.pom(scene, horizons=[0.5, 2.0], frame=frame, lost_mass=lost_mass)
+    assert (sparse.lost_mass <= lost_mass).all()
+    missing = dense.window_mass - sparse.window_mass
+    assert np.abs(missing - (sparse.lost_mass - dense.lost_mass)).max() < 3e-6
+    assert (np.count_nonzero(sparse.mass, axis=(2, 3)) <= np.count_nonzero(dense.mass, axis=(2, 3))).all()
+    rows, columns, mass = sparse.sparse(0, 0)
+    again = np.zeros_like(sparse.mass[0, 0])
+    again[rows, columns] = mass
+    np.testing.assert_array_equal(again, sparse.mass[0, 0])
+
+
+def test_accuracies_out_of_range_are_refused(forecaster, scene):
+    for wrong in ({"tolerance": 0.0}, {"tolerance": float("nan")}, {"lost_mass": -0.1}, {"lost_mass": 1.0}):
+        with pytest.raises(InputError, match="expected"):
+            forecaster.pom(scene, **wrong)
