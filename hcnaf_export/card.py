@@ -160,12 +160,18 @@ def _scores(scores: Mapping[str, Any]) -> str:
     rest = {name: value for name, value in scores.items() if name not in tables}
     parts = []
     if tables:
-        keys = list(dict.fromkeys(key for value in tables.values() for key in value))
+        keys = sorted(dict.fromkeys(key for value in tables.values() for key in value), key=_by_horizon)
         rows = [[key, *(_show(value.get(key)) for value in tables.values())] for key in keys]
         parts.append(table(["", *tables], rows))
     if rest:
         parts.append(_facts(rest))
     return "\n\n".join(parts) or "None were recorded with the checkpoint."
+
+
+def _by_horizon(key: str) -> float:
+    """Rows such as "0.5 s" in order, others after them as they came."""
+    number = key.removesuffix(" s")
+    return float(number) if number.replace(".", "", 1).isdigit() else float("inf")
 
 
 def _flat(value: Mapping[str, Any]) -> bool:

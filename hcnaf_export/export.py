@@ -75,7 +75,8 @@ def export_bundle(
     precisions.check(loaded.config, precision, calibration)
     scenes = calibrations.scenes(calibration) if calibration else []
     with _replacing(out) as folder:
-        rows, paid = _Export(loaded, folder, out.name, precision, scenes).run(progress or (lambda *_: None))
+        name = str(loaded.training.get("recipe") or out.name)
+        rows, paid = _Export(loaded, folder, name, precision, scenes).run(progress or (lambda *_: None))
     files = {f.name: f.stat().st_size for f in sorted(out.iterdir())}
     return ExportResult(rows, out, sum(files.values()), files, precision, paid)
 

@@ -54,6 +54,4 @@ def test_the_python_example_runs(embedded, scene_path, tmp_path, monkeypatch):
 def test_links_lead_somewhere():
     targets = re.findall(r"\]\(([^)#]+)\)", README)
     local = [target for target in targets if "://" not in target]
-    # The picture is made from the embedded model, and is there when that is.
-    missing = [t for t in local if not (ROOT / t).exists() and t != "docs/images/forecast.png"]
-    assert missing == []
+    assert [target for target in local if not (ROOT / target).exists()] == []
