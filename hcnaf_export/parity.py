@@ -21,7 +21,7 @@ from hcnaf_models.model import Hcnaf
 from hcnaf_runtime.errors import ParityError
 from hcnaf_runtime.manifest import Graph as GraphContract
 from hcnaf_runtime.manifest import ParityRow
-from hcnaf_runtime.session import Session
+from hcnaf_runtime.session import Session, Settings
 
 Array = npt.NDArray[Any]
 ONNXRUNTIME_MIN = "1.20"
@@ -34,7 +34,7 @@ def contract(graph: Graph) -> GraphContract:
 
 
 def open_graph(graph: Graph, folder: Path) -> Session:
-    return Session(folder / graph.file, contract(graph), _THREADS, ONNXRUNTIME_MIN)
+    return Session(folder / graph.file, contract(graph), Settings(_THREADS), ONNXRUNTIME_MIN)
 
 
 def run_torch(graph: Graph, feeds: Feeds) -> list[Array]:

@@ -8,7 +8,7 @@ from pathlib import Path
 from hcnaf_runtime import manifest as manifests
 from hcnaf_runtime.errors import BundleError
 from hcnaf_runtime.manifest import GraphName, Manifest
-from hcnaf_runtime.session import Session, default_threads
+from hcnaf_runtime.session import Session, Settings, default_threads
 
 EMBEDDED = Path(__file__).parent / "embedded"
 """The model and the sample scenes that come with the package."""
@@ -24,7 +24,7 @@ class Bundle:
     def __init__(self, path: Path, manifest: Manifest) -> None:
         self.path = path
         self.manifest = manifest
-        self._sessions: dict[tuple[str, int], Session] = {}
+        self._sessions: dict[tuple[str, Settings], Session] = {}
         self._lock = threading.Lock()
 
     @classmethod
@@ -43,17 +43,22 @@ class Bundle:
             _check_file(folder / name, expected)
         return cls(folder, manifest)
 
-    def session(self, name: GraphName, threads: int | None = None) -> Session:
-        """The graph `name`, loaded on first use. Raises BundleError if the bundle has none of that name."""
+    def session(self, name: GraphName, settings: Settings | int | None = None) -> Session:
+        """The graph `name`, loaded on first use; `settings` may be just a number of threads.
+
+        Raises BundleError if the bundle has none of that name.
+        """
         contract = self.manifest.graphs.get(name)
         if contract is None:
             have = ", ".join(sorted(self.manifest.graphs))
             raise BundleError(f"{self.path}: no graph '{name}', found {have}; maps need a flow of D = 2")
-        key = (name, threads or default_threads())
+        if not isinstance(settings, Settings):
+            settings = Settings(settings or default_threads())
+        key = (name, settings)
         with self._lock:
             if key not in self._sessions:
                 file = self.path / contract.file
-                self._sessions[key] = Session(file, contract, key[1], self.manifest.onnxruntime_min)
+                self._sessions[key] = Session(file, contract, settings, self.manifest.onnxruntime_min)
             return self._sessions[key]
 
 

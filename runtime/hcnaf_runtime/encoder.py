@@ -15,6 +15,7 @@ from hcnaf_runtime.bundle import Bundle
 from hcnaf_runtime.errors import HorizonError, SceneError
 from hcnaf_runtime.inputs import checked_horizons, condition_feeds, scene_feeds
 from hcnaf_runtime.scene import Condition, Scene
+from hcnaf_runtime.session import Settings
 
 Float32 = npt.NDArray[np.float32]
 Float64 = npt.NDArray[np.float64]
@@ -51,9 +52,9 @@ class _Slot:
 class Encoder:
     """Runs the hyper-network of `bundle`, once per scene and horizons. Thread-safe."""
 
-    def __init__(self, bundle: Bundle, threads: int) -> None:
+    def __init__(self, bundle: Bundle, settings: Settings) -> None:
         self._bundle = bundle
-        self._threads = threads
+        self._settings = settings
         self._slots: OrderedDict[Any, _Slot] = OrderedDict()
         self._lock = threading.Lock()
 
@@ -98,7 +99,7 @@ class Encoder:
         return Theta(values, pose.astype(np.float64), times, scene.target, feeds.notes, seconds)
 
     def _hypernet(self, outputs: list[str], tensors: dict[str, Any]) -> tuple[list[npt.NDArray[Any]], float]:
-        session = self._bundle.session("hypernet", self._threads)
+        session = self._bundle.session("hypernet", self._settings)
         start = time.perf_counter()
         values = session.run(outputs, {name: tensors[name] for name in session.inputs})
         seconds = time.perf_counter() - start

@@ -7,6 +7,7 @@ import numpy.typing as npt
 
 from hcnaf_runtime.bundle import Bundle
 from hcnaf_runtime.cells import CHUNK, Distribution
+from hcnaf_runtime.session import Settings
 
 Float32 = npt.NDArray[np.float32]
 
@@ -14,9 +15,9 @@ Float32 = npt.NDArray[np.float32]
 class Flow(Distribution):
     """The graphs of `bundle` that take theta [B, P]. Stateless and safe to share between threads."""
 
-    def __init__(self, bundle: Bundle, threads: int) -> None:
+    def __init__(self, bundle: Bundle, settings: Settings) -> None:
         self._bundle = bundle
-        self._threads = threads
+        self._settings = settings
 
     @property
     def dims(self) -> int:
@@ -54,7 +55,7 @@ class Flow(Distribution):
         return result
 
     def _run(self, graph: Any, output: str, **feeds: Float32) -> Float32:
-        session = self._bundle.session(graph, self._threads)
+        session = self._bundle.session(graph, self._settings)
         tensors = {name: np.ascontiguousarray(value) for name, value in feeds.items()}
         result: Float32 = session.run([output], tensors)[0]
         return result

@@ -15,7 +15,7 @@ from hcnaf_runtime.flow import Flow
 from hcnaf_runtime.grid import Grid
 from hcnaf_runtime.maps import Maps, Timings
 from hcnaf_runtime.scene import Condition, Scene
-from hcnaf_runtime.session import default_threads
+from hcnaf_runtime.session import Settings, default_threads
 
 Float32 = npt.NDArray[np.float32]
 Float64 = npt.NDArray[np.float64]
@@ -34,16 +34,34 @@ class Forecaster:
     """Forecasts with one bundle. Thread-safe; frees what it takes when it is dropped.
 
     `bundle` is an open Bundle, a directory, or None for the embedded model. `threads` is how many CPUs a
-    graph may use (None: those usable by this process, at most 4).
+    graph may use (None: those usable by this process, at most 4). `spinning` and `flush_denormals` trade the
+    rest of the machine for latency: see `session.Settings`. Graphs are loaded on first use; `warm_up` does it now.
     """
 
-    def __init__(self, bundle: Bundle | str | os.PathLike[str] | None = None, threads: int | None = None) -> None:
+    def __init__(
+        self,
+        bundle: Bundle | str | os.PathLike[str] | None = None,
+        threads: int | None = None,
+        *,
+        spinning: bool = False,
+        flush_denormals: bool = False,
+    ) -> None:
         if threads is not None and threads < 1:
             raise InputError(f"threads is {threads}, expected at least 1")
         self.bundle = bundle if isinstance(bundle, Bundle) else Bundle.open(bundle)
         self.threads = threads or default_threads()
-        self.flow = Flow(self.bundle, self.threads)
-        self._encoder = Encoder(self.bundle, self.threads)
+        settings = Settings(self.threads, spinning, flush_denormals)
+        self.flow = Flow(self.bundle, settings)
+        self._encoder = Encoder(self.bundle, settings)
+
+    def warm_up(self, scene: Scene | Condition, horizons: Horizons = None) -> None:
+        """Load every graph that forecasts need and run it once, so that the first real scene takes no longer.
+
+        Give a scene of the usual size: what onnxruntime allocates for it is kept and used again.
+        """
+        if self.flow.dims == 2:
+            self.pom(scene, horizons=horizons)
+        self.log_prob(scene, np.zeros((1, self.flow.dims), np.float32), horizons)
 
     def theta(self, scene: Scene | Condition, horizons: Horizons = None) -> Theta:
         """The flow's weights. The hyper-network runs once per scene and horizons; the last are remembered.

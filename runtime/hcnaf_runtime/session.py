@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,20 @@ def default_threads() -> int:
     return min(usable, MOST_THREADS)
 
 
+@dataclass(frozen=True)
+class Settings:
+    """How a graph runs.
+
+    `threads` may be used by one run. With `spinning` they wait for the next run in a busy loop: the lowest
+    latency, for a CPU that has nothing else to do. `flush_denormals` makes numbers below 1e-38 zero, in the
+    graph and from then on in the thread that loaded it.
+    """
+
+    threads: int
+    spinning: bool = False
+    flush_denormals: bool = False
+
+
 class Session:
     """A loaded graph. Safe to run from several threads at once.
 
@@ -29,14 +44,14 @@ class Session:
     inputs or outputs in it than the manifest says.
     """
 
-    def __init__(self, path: Path, contract: manifest.Graph, threads: int, onnxruntime_min: str) -> None:
+    def __init__(self, path: Path, contract: manifest.Graph, settings: Settings, onnxruntime_min: str) -> None:
         import onnxruntime  # here, because it costs more than the rest of the package together
 
         _check_version(onnxruntime.__version__, onnxruntime_min, path)
         self._path = path
         try:
             self._session = onnxruntime.InferenceSession(
-                path, _options(onnxruntime, threads), providers=["CPUExecutionProvider"]
+                path, _options(onnxruntime, settings), providers=["CPUExecutionProvider"]
             )
         except Exception as e:  # onnxruntime's exceptions share no base but Exception
             raise BundleError(f"{path}: onnxruntime cannot load it ({_first_line(e)}); export again") from e
@@ -54,16 +69,17 @@ class Session:
         return result
 
 
-def _options(onnxruntime: Any, threads: int) -> Any:
+def _options(onnxruntime: Any, settings: Settings) -> Any:
     options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = threads
+    options.intra_op_num_threads = settings.threads
     options.inter_op_num_threads = 1
     options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
     options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_ENABLE_ALL
     options.log_severity_level = 3  # errors only: everything that matters is raised
     # Threads that spin between calls take the CPU from whatever else runs on the vehicle.
-    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    # Denormals stay: flushing them would outlive the session in the calling thread, for all it computes.
+    options.add_session_config_entry("session.intra_op.allow_spinning", str(int(settings.spinning)))
+    if settings.flush_denormals:
+        options.add_session_config_entry("session.set_denormal_as_zero", "1")
     return options
 
 

@@ -10,7 +10,7 @@ from hcnaf_export.probes import SCENES, SceneSetting, flow_cases, scene
 from hcnaf_models.config import ConditionConfig
 from hcnaf_models.model import build
 from hcnaf_models.spec import FlowSpec
-from hcnaf_runtime.session import Session
+from hcnaf_runtime.session import Session, Settings
 
 POM_GRAPHS = ("hypernet", "flow", "marginal_cdf", "conditional_cdf", "cell_mass")
 
@@ -21,7 +21,7 @@ def part(exported, name):
 
 def session(exported, name):
     graph = part(exported, name)
-    return Session(exported.path / graph.file, contract(graph), 1, "1.20")
+    return Session(exported.path / graph.file, contract(graph), Settings(1), "1.20")
 
 
 def ones(graph, sizes):

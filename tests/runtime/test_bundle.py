@@ -17,11 +17,11 @@ def _edit(folder, **changes):
 
 def test_opens_and_runs(bundle):
     assert bundle.manifest.kind == "pom"
-    session = bundle.session("marginal_cdf", threads=1)
+    session = bundle.session("marginal_cdf", 1)
     theta = np.float32([[1, 0, 2, 1, 0]])
     (cdf,) = session.run(["cdf"], {"theta": theta, "x": np.float32([[-1e6, 1, 1e6]])})
     np.testing.assert_allclose(cdf, [[0, 0.5, 1]])
-    assert bundle.session("marginal_cdf", threads=1) is session
+    assert bundle.session("marginal_cdf", 1) is session
 
 
 def test_manifest_round_trip(bundle_path, tmp_path):

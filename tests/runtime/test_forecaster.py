@@ -294,3 +294,11 @@ def test_accuracies_out_of_range_are_refused(forecaster, scene):
     for wrong in ({"tolerance": 0.0}, {"tolerance": float("nan")}, {"lost_mass": -0.1}, {"lost_mass": 1.0}):
         with pytest.raises(InputError, match="expected"):
             forecaster.pom(scene, **wrong)
+
+
+@pytest.mark.parametrize("settings", [{}, {"spinning": True}, {"threads": 1}, {"threads": 3, "spinning": True}])
+def test_settings_change_no_result(bundle_path, scene, settings):
+    fast = Forecaster(bundle_path, **settings)
+    fast.warm_up(scene)
+    expected = Forecaster(bundle_path, threads=2).pom(scene, horizons=[1.0, 3.0]).mass
+    np.testing.assert_array_equal(fast.pom(scene, horizons=[1.0, 3.0]).mass, expected)
