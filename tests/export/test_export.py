@@ -56,7 +56,7 @@ def test_files_of_a_bundle(pom, line):
 
 def test_manifest_of_a_scene_bundle(pom):
     m, config = Bundle.open(pom.path).manifest, pom.model.config
-    assert (m.kind, m.name, m.opset, m.ir_version) == ("pom", "bundle", 18, 10)
+    assert (m.kind, m.name, m.opset, m.ir_version) == ("pom", "none", 18, 10)
     assert (m.flow.dims, m.flow.layers, m.flow.hidden, m.flow.weight_norm) == (2, 2, 20, "row")
     assert m.flow.parameters == config.flow.parameters
     assert (m.scene.history, m.scene.step, m.scene.stops) == (10, 0.1, True)

@@ -22,7 +22,9 @@ def walked(request, tmp_path_factory):
     layers, hidden = request.param
     recipe = read_recipe("toy1")
     model = replace(recipe.model, flow=replace(recipe.model.flow, layers=layers, hidden=hidden))
-    optimiser = msgspec.structs.replace(recipe.optimiser, steps=40, batch=64, warm_up=5, validate_every=40)
+    optimiser = msgspec.structs.replace(
+        recipe.optimiser, steps=40, batch=64, learning_rate=3e-4, warm_up=5, validate_every=40
+    )
     recipe = msgspec.structs.replace(recipe, model=model, optimiser=optimiser)
     folder = tmp_path_factory.mktemp("path")
     run_training(recipe, None, folder / "run")

@@ -85,6 +85,6 @@ def test_training_lowers_the_divergence(tmp_path):
 
 def test_a_model_of_another_condition_is_refused():
     recipe = read_recipe("toy1")
-    model = msgspec.convert({**msgspec.to_builtins(recipe.model), "size": 2}, type(recipe.model))
+    model = msgspec.convert({**msgspec.to_builtins(recipe.model), "size": 2, "examples": []}, type(recipe.model))
     with pytest.raises(RecipeError, match=r"model.size is 2"):
         ToyTask(msgspec.structs.replace(recipe, model=model), torch.device("cpu"))
