@@ -1,5 +1,6 @@
 import numpy as np
 import onnx
+import onnxruntime
 import pytest
 import torch
 
@@ -10,6 +11,8 @@ from hcnaf_export.probes import SCENES, SceneSetting, flow_cases, scene
 from hcnaf_models.config import ConditionConfig
 from hcnaf_models.model import build
 from hcnaf_models.spec import FlowSpec
+from hcnaf_runtime.bundle import EMBEDDED
+from hcnaf_runtime.scene import Scene
 from hcnaf_runtime.session import Session, Settings
 
 POM_GRAPHS = ("hypernet", "flow", "marginal_cdf", "conditional_cdf", "cell_mass")
@@ -170,3 +173,26 @@ def test_examples_are_never_of_size_one_and_tell_sizes_apart():
 def test_a_graph_is_in_evaluation_mode(pom):
     assert not any(m.training for g in graphs(pom.model) for m in g.module.modules())
     assert torch.is_grad_enabled()
+
+
+def test_the_encoder_runs_once_per_target_whatever_the_horizons(tmp_path):
+    """Every convolution of the embedded model sees one image per target, or the one of its places."""
+    model = onnx.load(EMBEDDED / "model" / "hypernet.onnx")
+    outputs = [node.output[0] for node in model.graph.node if node.op_type == "Conv"]
+    assert len(outputs) > 5
+    model.graph.output.extend(onnx.ValueInfoProto(name=name) for name in outputs)
+    onnx.save(model, tmp_path / "seen.onnx")
+    run = onnxruntime.InferenceSession(tmp_path / "seen.onnx", providers=["CPUExecutionProvider"])
+    scene = Scene.load(EMBEDDED / "scenes" / "junction.npz")
+    feeds = {
+        "past": scene.past,
+        "size": scene.size,
+        "target": scene.target[:3],
+        "raster": scene.raster,
+        "raster_origin": scene.origin,
+        "raster_resolution": np.float32([scene.resolution]),
+    }
+    for horizons in ([1.0], np.linspace(0.2, 4.0, 20)):
+        found = run.run(outputs, feeds | {"horizons": np.float32(horizons)})
+        assert {len(images) for images in found} <= {1, 3}
+        assert sum(len(images) == 3 for images in found) >= len(found) / 2
