@@ -51,10 +51,10 @@ class ColumnMassGraph(nn.Module):
         B = theta.shape[0]
         F_1 = planar.marginal_cdf(self.spec, theta, torch.cat([left, right[-1:]]).expand(B, -1))
         share = torch.clamp(F_1[:, 1:] - F_1[:, :-1], min=0.0)
-        x, y = (0.5 * (left + right)).expand(B, -1), y_edges.expand(B, 1, -1)
-        F_2 = planar.conditional_cdf(self.spec, theta, x, y, self.fraction)
-        increments = torch.clamp(F_2[..., 1:] - F_2[..., :-1], min=0.0)  # [B, S, V - 1]
-        return (increments * share.unsqueeze(-1)).transpose(-1, -2)
+        x, y = (0.5 * (left + right)).expand(B, -1), y_edges.expand(B, -1)
+        F_2 = planar.grid_cdf(self.spec, theta, x, y, self.fraction)  # [B, V, S]
+        increments = torch.clamp(F_2[:, 1:] - F_2[:, :-1], min=0.0)
+        return increments * share.unsqueeze(1)
 
 
 class ForecastGraph(nn.Module):

@@ -4,7 +4,7 @@ Every size that may vary is named by a letter in the contract; the same letter i
 
     A  targets      N  agents in the scene, or points      T  horizons       R x C  raster rows and columns
     B  maps (agents x horizons, flattened)                 S  stop lines, or nodes in x       E  edges in y
-    U, V  edges of a grid in x and y
+    U, V  edges of a grid in x and y                       M  samples
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from hcnaf_models import flow, planar
+from hcnaf_models import density, flow, normal, planar, sampling
 from hcnaf_models.config import PomConfig
 from hcnaf_models.geometry import pose_of
 from hcnaf_models.mlp import ConditionHyperNet
@@ -49,6 +49,8 @@ class FlowGraph(nn.Module):
         self.spec = spec
 
     def forward(self, theta: Tensor, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        if self.spec.dims == 2:
+            return density.density(self.spec, theta, points, shipped_log_interval)
         image = flow.forward(self.spec, theta, points)
         return flow.log_prob_terms(self.spec, image).sum(-1), image.z, image.log_dz.sum(-1)
 
@@ -61,7 +63,7 @@ class MarginalCdfGraph(nn.Module):
         self.spec = spec
 
     def forward(self, theta: Tensor, x: Tensor) -> Tensor:
-        return planar.marginal_cdf(self.spec, theta, x)
+        return planar.marginal_cdf(self.spec, theta, x, shipped_fraction)
 
 
 ERF_FROM = 0.1
@@ -71,11 +73,20 @@ stable form is run, which takes ten times as long."""
 
 def shipped_fraction(z: Tensor) -> Tensor:
     """`planar.stable_fraction`, by erf where that is accurate enough for all of z: an `If` in the graph."""
-    limits = torch.erf(z[..., -2:] * math.sqrt(0.5))
-    least = (limits[..., 1] - limits[..., 0]).min() * 0.5
+    limits = torch.erf(z[:, -2:] * math.sqrt(0.5))
+    least = (limits[:, 1] - limits[:, 0]).min() * 0.5
     # A branch may not share its input with what surrounds it (torch.cond), hence the product; it is dropped.
     F: Tensor = torch.cond(least > ERF_FROM, planar.fast_fraction, planar.stable_fraction, (z * 1.0,))
     return F
+
+
+def shipped_log_interval(a: Tensor, b: Tensor) -> Tensor:
+    """`normal.log_interval`, by erf where that is accurate enough for all: an `If` in the graph."""
+    least = (torch.erf(b * math.sqrt(0.5)) - torch.erf(a * math.sqrt(0.5))).min() * 0.5
+    log_mass: Tensor = torch.cond(
+        least > ERF_FROM, density.fast_log_interval, normal.log_interval, (a * 1.0, b * 1.0)
+    )
+    return log_mass
 
 
 class ConditionalCdfGraph(nn.Module):
@@ -90,14 +101,25 @@ class ConditionalCdfGraph(nn.Module):
 
 
 class CellMassGraph(nn.Module):
-    """theta [B, P], x [B, S], weight [B, C, S], y [B, E] -> mass [B, E - 1, C]."""
+    """theta [B,P], x [B,S], weight, doubt [B,S,C], y [B,E] -> mass [B,E-1,C], error [B,C], cdf [B,E,S]."""
 
     def __init__(self, spec: FlowSpec) -> None:
         super().__init__()
         self.spec = spec
 
-    def forward(self, theta: Tensor, x: Tensor, weight: Tensor, y: Tensor) -> Tensor:
-        return planar.cell_mass(self.spec, theta, x, weight, y, shipped_fraction)
+    def forward(self, theta: Tensor, x: Tensor, weight: Tensor, doubt: Tensor, y: Tensor) -> planar.Cells:
+        return planar.cell_mass(self.spec, theta, x, weight, doubt, y, shipped_fraction)
+
+
+class InverseGraph(nn.Module):
+    """theta [B, P], uniform [B, M, 2] -> points [B, M, 2], log_prob [B, M]."""
+
+    def __init__(self, spec: FlowSpec) -> None:
+        super().__init__()
+        self.spec = spec
+
+    def forward(self, theta: Tensor, uniform: Tensor) -> tuple[Tensor, Tensor]:
+        return sampling.planar_inverse(self.spec, theta, uniform)
 
 
 class ConditionGraph(nn.Module):
@@ -170,11 +192,11 @@ def reads_others(config: PomConfig) -> bool:
 
 
 def graphs(model: Hcnaf) -> list[Graph]:
-    """All graphs of a model's bundle: the hyper-network, the flow and, for D = 2, the distribution functions."""
+    """All graphs of a model's bundle: the hyper-network, the flow and, for D = 2, what follows from it."""
     spec = model.config.flow
     out = [_hypernet(model), _flow(spec)]
     if spec.dims == 2:
-        out += [_marginal_cdf(spec), _conditional_cdf(spec), _cell_mass(spec)]
+        out += [_marginal_cdf(spec), _conditional_cdf(spec), _cell_mass(spec), _inverse(spec)]
     for graph in out:
         graph.module.eval()
     return out
@@ -251,8 +273,24 @@ def _cell_mass(spec: FlowSpec) -> Graph:
     inputs = (
         _theta(spec),
         _tensor("x", "B S", "m", "nodes"),
-        _tensor("weight", "B C S", "", "what each node counts for in each column"),
+        _tensor("weight", "B S C", "", "what each node counts for in each column"),
+        _tensor("doubt", "B S C", "", "the weights minus those of a lesser rule"),
         _tensor("y", "B E", "m", "cell edges, ascending"),
     )
-    mass = _tensor("mass", "B E-1 C", "", "probability of each cell")
-    return Graph("cell_mass", CellMassGraph(spec), inputs, (mass,))
+    outputs = (
+        _tensor("mass", "B E-1 C", "", "probability of each cell"),
+        _tensor(
+            "error", "B C", "", "largest sum of each column with the weights of the doubt, or what was below 0"
+        ),
+        _tensor("cdf", "B E S", "", "F_2(y given x)"),
+    )
+    return Graph("cell_mass", CellMassGraph(spec), inputs, outputs)
+
+
+def _inverse(spec: FlowSpec) -> Graph:
+    uniform = _tensor("uniform", "B M 2", "", "values of F_1 and F_2, inside (0, 1)")
+    outputs = (
+        _tensor("points", "B M 2", "m", "the points with these values, in the frame of theta"),
+        _tensor("log_prob", "B M", "nat per m^2", "log p at the points"),
+    )
+    return Graph("inverse", InverseGraph(spec), (_theta(spec), uniform), outputs)

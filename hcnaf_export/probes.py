@@ -21,6 +21,9 @@ Feeds = dict[str, Array]
 RESOLVED = 0.3
 """Least normal mass of the image of y at which F_2 is compared."""
 
+STAIRS = ("saturated", "faint")
+"""Made-up flows whose z is a staircase or constant in float32: they have no inverse that two programs agree on."""
+
 SEED = 20_200_614
 FAR = (1e2, 1e4, 1e6)
 DENORMAL = 1e-40
@@ -210,7 +213,10 @@ def points(spec: FlowSpec, theta: Array, rng: np.random.Generator, count: int = 
 
 def flow_cases(graph: str, spec: FlowSpec, trained: dict[str, Array]) -> dict[str, Feeds]:
     """Named inputs of one of the flow's graphs, for the model's own theta and made-up ones."""
-    return {name: flow_feeds(graph, spec, theta) for name, theta in thetas(spec, trained).items()}
+    cases = thetas(spec, trained)
+    if graph == "inverse":
+        cases = {name: theta for name, theta in cases.items() if name not in STAIRS}
+    return {name: flow_feeds(graph, spec, theta) for name, theta in cases.items()}
 
 
 def flow_feeds(graph: str, spec: FlowSpec, theta: Array) -> Feeds:
@@ -218,6 +224,8 @@ def flow_feeds(graph: str, spec: FlowSpec, theta: Array) -> Feeds:
     rng = np.random.default_rng(SEED)
     if graph == "cell_mass":
         return {"theta": theta, **_cells(spec, theta, rng)}
+    if graph == "inverse":
+        return {"theta": theta, "uniform": _uniforms(spec, theta, rng)}
     where = points(spec, theta, rng)
     if graph == "flow":
         return {"theta": theta, "points": where}
@@ -227,6 +235,13 @@ def flow_feeds(graph: str, spec: FlowSpec, theta: Array) -> Feeds:
     y = np.sort(np.concatenate([where[:, ::3, 1], ends], axis=-1), axis=-1)
     x = _resolved(spec, theta, where[:, ::4, 0])
     return {"theta": theta, "x": x, "y": np.repeat(y[:, None], x.shape[1], axis=1)}
+
+
+def _uniforms(spec: FlowSpec, theta: Array, rng: np.random.Generator, count: int = 60) -> Array:
+    """u [B, N, D], even in log(u / (1 - u)): farther out x is worth no comparison, as dz/dx is too small."""
+    odds = rng.uniform(-5.0, 5.0, (len(theta), count, spec.dims))
+    u: Array = (1.0 / (1.0 + np.exp(-odds))).astype(np.float32)
+    return u
 
 
 def _resolved(spec: FlowSpec, theta: Array, x: Array) -> Array:
@@ -252,8 +267,11 @@ def _cells(spec: FlowSpec, theta: Array, rng: np.random.Generator, columns: int 
     x = _resolved(spec, theta, x.astype(np.float32))
     y = location[0, 1] + scale[0, 1] * np.linspace(-5.0, 5.0, 41)
     share = rng.dirichlet(np.ones(S), size=len(theta))
-    weight = np.zeros((len(theta), columns, S))
+    weight = np.zeros((len(theta), S, columns))
     for c in range(columns):
-        weight[:, c, c * nodes : (c + 1) * nodes] = share[:, c * nodes : (c + 1) * nodes]
+        weight[:, c * nodes : (c + 1) * nodes, c] = share[:, c * nodes : (c + 1) * nodes]
+    doubt = np.roll(weight, nodes, axis=1) - weight
     edges = np.tile(np.concatenate([[-1e6], y, [1e6]]), (len(theta), 1))
-    return {name: v.astype(np.float32) for name, v in (("x", x), ("weight", weight), ("y", edges))}
+    return {
+        name: v.astype(np.float32) for name, v in (("x", x), ("weight", weight), ("doubt", doubt), ("y", edges))
+    }

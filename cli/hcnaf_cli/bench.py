@@ -16,7 +16,9 @@ _MIB = 1 << 20
 @click.command()
 @click.argument("bundle", type=_FILE, required=False)
 @click.option("--scene", "files", type=_FILE, multiple=True, metavar="SCENE.npz", help="Instead of the samples.")
-@click.option("--only", metavar="A,B", help="Sections: hypernet, dense, certified, forecast, points, memory.")
+@click.option(
+    "--only", metavar="A,B", help="Sections: hypernet, dense, certified, forecast, points, samples, risk, memory."
+)
 @click.option(
     "--seconds", type=click.FloatRange(min=0.0, max=600.0), default=1.0, show_default=True, help="Per case."
 )

@@ -10,6 +10,9 @@ import click
 
 from hcnaf_cli.bench import bench
 from hcnaf_cli.errors import Commands
+from hcnaf_cli.occupancy import occupancy
+from hcnaf_cli.risk import risk
+from hcnaf_cli.sample import sample
 from hcnaf_runtime._version import __version__
 
 if TYPE_CHECKING:
@@ -199,3 +202,6 @@ def verify(bundle: Path | None, threads: int | None, as_json: bool) -> None:
 
 
 main.add_command(bench)
+main.add_command(occupancy)
+main.add_command(risk)
+main.add_command(sample)

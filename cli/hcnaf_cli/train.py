@@ -258,6 +258,13 @@ def export(
 @click.option("--horizons", metavar="0.5,1,4", help="Seconds ahead [default: every half second].")
 @click.option("--limit", type=click.IntRange(min=0), default=0, help="Score at most about so many windows.")
 @click.option(
+    "--samples-windows",
+    type=click.IntRange(min=0),
+    default=400,
+    show_default=True,
+    help="Score samples of a bundle on at most about so many windows (min_ade_k, miss_rate, energy_score).",
+)
+@click.option(
     "--record", is_flag=True, help="Keep the scores in the checkpoint; exports carry them in their card."
 )
 @_device
@@ -270,6 +277,7 @@ def evaluate(
     split: Literal["train", "val", "test"],
     horizons: str | None,
     limit: int,
+    samples_windows: int,
     record: bool,
     device: str,
     threads: int | None,
@@ -299,7 +307,9 @@ def evaluate(
         if loaded:
             scores = evaluation.evaluate_checkpoint(loaded, data, split, device=device, **common)
         else:
-            scores = evaluation.evaluate_bundle(bundle, data, split, threads=threads, **common)
+            scores = evaluation.evaluate_bundle(
+                bundle, data, split, samples=samples_windows, threads=threads, **common
+            )
     if ckpt and loaded and record:
         _record(ckpt, loaded, scores.record())
     show_json(scores.as_dict()) if as_json else click.echo(tables.scores_text(scores))

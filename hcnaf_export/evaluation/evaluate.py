@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hcnaf_export.baselines import ConstantVelocityGaussian
+from hcnaf_export.baselines import ConstantVelocityGaussian, labels
 from hcnaf_export.checkpoint import Checkpoint, load_checkpoint
 from hcnaf_export.data.tracks import FUTURE, HISTORY, Dataset, Split, TrackSet
-from hcnaf_export.evaluation.predictors import BundlePredictor, CheckpointPredictor, Predictor
+from hcnaf_export.evaluation import paths
+from hcnaf_export.evaluation.predictors import BundlePredictor, CheckpointPredictor, Predictor, Sampler
 from hcnaf_export.evaluation.scores import Scores, summarise
 from hcnaf_export.training.toy import Divergence, evaluate_toy, toy_of
 from hcnaf_models.config import ConditionConfig
@@ -19,6 +20,9 @@ from hcnaf_runtime.errors import CheckpointError, DataError
 from hcnaf_runtime.forecaster import Forecaster
 
 HORIZONS = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0)
+
+SAMPLED = 400
+"""Windows whose samples are scored, unless told otherwise."""
 
 Report = Callable[[float], None]
 """Told the fraction done, in [0, 1]."""
@@ -31,9 +35,10 @@ def evaluate(
     *,
     horizons: Sequence[float] = HORIZONS,
     limit: int = 0,
+    samples: int = SAMPLED,
     report: Report | None = None,
 ) -> Scores:
-    """NLL of the recorded labels per horizon, with standard errors over scenes.
+    """NLL of the recorded labels per horizon, with standard errors over scenes; and scores of samples.
 
     Windows of one network within one window's length (5 s) see the same traffic: they form a cluster, and errors
     are computed over clusters. What differs from network to network is not in the errors.
@@ -44,6 +49,8 @@ def evaluate(
         split: which networks to score on.
         horizons: s, multiples of the recording's step.
         limit: score at most so many windows, spread evenly; 0 for all.
+        samples: score the samples of at most so many of these windows (see `paths`); 0 for none. Predictors that
+            draw none have no such scores.
         report: told how far it is.
 
     Raises:
@@ -65,7 +72,7 @@ def evaluate(
             if report:
                 report(done / total)
         compared.append(baseline.nll(tracks, windows, horizons))
-        clusters.append(i * 10**6 + windows[:, 1].astype(np.int64) // (HISTORY + FUTURE))
+        clusters.append(_clusters(i, windows))
     return summarise(
         horizons,
         np.concatenate(scored),
@@ -75,7 +82,33 @@ def evaluate(
         data=dataset.directory.name,
         split=split,
         floor=dataset.manifest.nll_floor,
+        samples=_sample_scores(predictor, sets, chosen, horizons, samples),
     )
+
+
+def _sample_scores(
+    predictor: Predictor,
+    sets: Sequence[TrackSet],
+    chosen: Sequence[NDArray[np.int32]],
+    horizons: tuple[float, ...],
+    limit: int,
+) -> paths.SampleScores | None:
+    """Scores of paths on a part of the windows `chosen`, if any are asked for and the predictor draws them."""
+    if not limit or not isinstance(predictor, Sampler) or not predictor.draws:
+        return None
+    found, clusters = [], []
+    for i, (tracks, windows) in enumerate(zip(sets, chosen, strict=True)):
+        some = _some(windows, limit, len(sets))
+        if len(some):
+            drawn = predictor.paths(tracks, some, horizons, paths.DRAWS)
+            found.append(paths.score_paths(drawn, labels(tracks, some, horizons)))
+            clusters.append(_clusters(i, some))
+    return paths.summarise_paths(horizons, paths.joined(found), np.concatenate(clusters))
+
+
+def _clusters(number: int, windows: NDArray[np.int32]) -> NDArray[np.int64]:
+    """Which windows of track set `number` see the same traffic."""
+    return number * 10**6 + windows[:, 1].astype(np.int64) // (HISTORY + FUTURE)
 
 
 def evaluate_checkpoint(
@@ -101,12 +134,15 @@ def evaluate_bundle(
     *,
     horizons: Sequence[float] = HORIZONS,
     limit: int = 0,
+    samples: int = SAMPLED,
     threads: int | None = None,
     report: Report | None = None,
 ) -> Scores:
     """`evaluate` of a bundle through the runtime, one by one; None is the embedded one. Raises BundleError too."""
     predictor = BundlePredictor(Forecaster(bundle, threads=threads))
-    return evaluate(predictor, Dataset(data), split, horizons=horizons, limit=limit, report=report)
+    return evaluate(
+        predictor, Dataset(data), split, horizons=horizons, limit=limit, samples=samples, report=report
+    )
 
 
 def evaluate_toy_checkpoint(
@@ -127,7 +163,12 @@ def evaluate_toy_checkpoint(
 
 
 def _spread(tracks: TrackSet, limit: int, sets: int) -> NDArray[np.int32]:
-    """At most about limit / sets windows of a track set, evenly taken."""
-    W = len(tracks.windows)
-    count = min(W, -(-limit // sets)) if limit else W
-    return tracks.windows[(np.arange(count) * W) // max(count, 1)]
+    """At most about limit / sets windows of a track set, evenly taken; all for 0."""
+    return _some(tracks.windows, limit, sets) if limit else tracks.windows
+
+
+def _some(windows: NDArray[np.int32], limit: int, sets: int) -> NDArray[np.int32]:
+    """At most about limit / sets of the windows, evenly taken."""
+    W = len(windows)
+    count = min(W, -(-limit // sets))
+    return windows[(np.arange(count) * W) // max(count, 1)]

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -19,6 +19,7 @@ from hcnaf_export.training.windows import WindowPool
 from hcnaf_models.config import PomConfig
 from hcnaf_runtime.errors import CheckpointError, HorizonError
 from hcnaf_runtime.forecaster import Forecaster
+from hcnaf_runtime.scene import Scene
 
 Float = NDArray[np.float64]
 Windows = NDArray[np.int32]
@@ -38,6 +39,18 @@ class Predictor(Protocol):
         """-log p of the recorded labels (nats per m²), [W, Q], of windows [W, 2] (track, step) at horizons (s)."""
 
 
+@runtime_checkable
+class Sampler(Protocol):
+    """What can draw paths too."""
+
+    @property
+    def draws(self) -> bool:
+        """Whether this one can."""
+
+    def paths(self, tracks: TrackSet, windows: Windows, horizons: Sequence[float], count: int) -> Float:
+        """`count` paths per window [W, count, Q, 2] (m, the network's frame), horizons coupled by quantiles."""
+
+
 class BundlePredictor:
     """An exported bundle on the path a vehicle takes: one `Scene` per window, its ego the only target.
 
@@ -51,12 +64,32 @@ class BundlePredictor:
         """See `Predictor.nll`."""
         points = labels(tracks, windows, horizons)
         out = np.empty((len(windows), len(horizons)))
-        for i, (track, step) in enumerate(windows.tolist()):
-            scene = tracks.scene(track, step, max_targets=1)
-            centre = tracks.observed[tracks.rows(track, step), :2].astype(np.float64)
+        for i, (scene, centre) in enumerate(_scenes(tracks, windows)):
             local = (points[i] - centre)[None, :, None, :]
             out[i] = -self.forecaster.log_prob(scene, local, horizons, frame="scene")[0, :, 0]
         return out
+
+    @property
+    def draws(self) -> bool:
+        """See `Sampler.draws`: bundles from before there were samples cannot."""
+        return "inverse" in self.forecaster.bundle.manifest.graphs
+
+    def paths(self, tracks: TrackSet, windows: Windows, horizons: Sequence[float], count: int) -> Float:
+        """See `Sampler.paths`. A window's draws are the same whatever other windows are scored."""
+        out = np.empty((len(windows), count, len(horizons), 2))
+        for i, (scene, centre) in enumerate(_scenes(tracks, windows)):
+            track, step = windows[i].tolist()
+            seed = track * 1_000_003 + step
+            made = self.forecaster.trajectories(scene, count, horizons, seed, "scene")
+            out[i] = made.points[0].transpose(1, 0, 2) + centre
+        return out
+
+
+def _scenes(tracks: TrackSet, windows: Windows) -> Iterator[tuple[Scene, Float]]:
+    """Each window's scene with its ego the only target, and where the scene's origin is in the network's frame."""
+    for track, step in windows.tolist():
+        centre = tracks.observed[tracks.rows(track, step), :2].astype(np.float64)
+        yield tracks.scene(track, step, max_targets=1), centre
 
 
 class CheckpointPredictor:

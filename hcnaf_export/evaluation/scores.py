@@ -6,7 +6,10 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
+
+from hcnaf_export.evaluation.paths import SampleScores
+from hcnaf_export.evaluation.spread import mean_and_error as mean_and_error
 
 
 class Score(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -38,6 +41,7 @@ class Scores(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         rows: one per horizon.
         mean: mean NLL over the horizons, nats per m². mean_error: its standard error.
         floor: entropy of the label noise, nats per m²; no predictor's expected NLL lies below it.
+        samples: scores of samples and paths, of a predictor that draws them.
     """
 
     predictor: str
@@ -49,6 +53,7 @@ class Scores(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     mean: float
     mean_error: float
     floor: float
+    samples: SampleScores | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """Plain data, fit for JSON."""
@@ -68,6 +73,7 @@ class Scores(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             f"{self.split} constant velocity": column("baseline"),
             f"{self.split} windows": self.windows,
             f"{self.split} floor of the label noise": self.floor,
+            **(self.samples.record(self.split) if self.samples else {}),
         }
 
     def table(self) -> list[tuple[str, ...]]:
@@ -83,21 +89,6 @@ class Scores(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             for r in self.rows
         ]
         return [head, *rows]
-
-
-def mean_and_error(values: ArrayLike, cluster: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Means [Q] of values [W, Q] and their standard errors, with windows of one cluster taken as dependent.
-
-    The cluster-robust error: sqrt(C / (C - 1) sum_c (sum_{i in c} (v_i - mean))²) / W. With windows that
-    overlap in time it is far larger than the naive std / sqrt(W), and right. NaN for a single cluster.
-    """
-    v = np.asarray(values, dtype=np.float64)
-    _, group = np.unique(np.asarray(cluster), return_inverse=True)
-    C = int(group.max()) + 1
-    sums = np.zeros((C, v.shape[1]))
-    np.add.at(sums, group, v - v.mean(axis=0))
-    factor = C / (C - 1) if C > 1 else np.nan
-    return v.mean(axis=0), np.sqrt(factor * np.square(sums).sum(axis=0)) / len(v)
 
 
 def summarise(

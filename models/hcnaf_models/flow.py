@@ -122,12 +122,13 @@ def _damp(u: Tensor, a: Tensor, log_scale: Tensor | float = 0.0) -> tuple[Tensor
     """u * tanh'(a) as (tangent, log-scale), the tangent's largest entry being 1.
 
     tanh' = 4 e / (1 + e)^2 with e = exp(-2|a|). The slowest decay of each point is taken out first, so that far
-    from the data nothing underflows before it is scaled. Scales are constants to the gradient: they cancel.
+    from the data nothing underflows before it is scaled. Scales are constants to the gradient: they cancel. Decay
+    is held at 1e-26 beside the slowest: denormal numbers would take a product many times as long.
     """
     size = torch.abs(a)
     least = size.amin(dim=-1, keepdim=True).detach()
     e = torch.exp(-2.0 * size)
-    t = u * torch.exp(-2.0 * (size - least)) * (4.0 / (1.0 + e) ** 2)
+    t = u * torch.exp(-2.0 * torch.clamp(size - least, max=30.0)) * (4.0 / (1.0 + e) ** 2)
     largest = torch.clamp(t.amax(dim=-1, keepdim=True).detach(), min=1.2e-38)
     return t / largest, log_scale - 2.0 * least + torch.log(largest)
 

@@ -21,6 +21,7 @@ _ERFCX = (
     -1.26551223, 1.00002368, 0.37409196, 0.09678418, -0.18628806,
     0.27886807, -1.13520398, 1.48851587, -0.82215223, 0.17087277,
 )  # fmt: skip
+_FLOOR = -55.0
 _LOG_HALF = math.log(0.5)
 _LOG_SQRT_2PI = 0.5 * math.log(2.0 * math.pi)
 
@@ -97,9 +98,12 @@ def interval_fraction(z: Tensor, a: Tensor, b: Tensor) -> Tensor:
 
 
 def _scaled_tail(u: Tensor, m: Tensor) -> Tensor:
-    """exp(m^2 / 2) Phi(-u) for u >= |m|, m <= 0."""
+    """exp(m^2 / 2) Phi(-u) for u >= |m|, m <= 0; not below about 1e-26.
+
+    Without the floor tails would be full of denormal numbers, which take a CPU a hundred times as long.
+    """
     t, p = _fit(u * math.sqrt(0.5))
-    return (0.5 * t) * torch.exp(p + 0.5 * (m - u) * (m + u))
+    return (0.5 * t) * torch.exp(torch.clamp(p + 0.5 * (m - u) * (m + u), min=_FLOOR))
 
 
 def _scaled_cdf(z: Tensor, m: Tensor) -> Tensor:

@@ -6,8 +6,9 @@ r"""Exact distribution functions of a two-dimensional flow (a Knothe-Rosenblatt 
 Everything that depends on x alone (dimension 1, and its context for dimension 2) is computed once per x and
 broadcast over y. `normalised` support uses the formulas above, `paper` support Phi alone.
 
-Written for the graphs that ship, where this is the hot path: arrays over y are [B, S, H, E], one product per x
-with its context broadcast along contiguous memory, and the limits z_2(-), z_2(+) ride along as images of
+Written for the graphs that ship, where this is the hot path. The nodes s lie along contiguous memory. On a grid,
+arrays are [B, E, H, S]: what depends on x is added in runs of H S numbers. At points of their own they are
+[B, H, E S]: one product per layer, however few nodes there are. The limits z_2(-), z_2(+) ride along as images of
 y = -+`FAR`.
 """
 
@@ -23,7 +24,7 @@ from hcnaf_models.normal import cdf, erf_fraction, interval_fraction
 from hcnaf_models.spec import FlowSpec
 
 Fraction = Callable[[Tensor], Tensor]
-"""F [..., E] from z [..., E], whose last two entries are its limits z(-) and z(+), where F is 0 and 1."""
+"""F [B, E, ...] from z [B, E, ...], whose last two along E are its limits z(-) and z(+), where F is 0 and 1."""
 
 FAR = 1e30
 """A y (or x) whose first-layer units are all saturated, in either direction."""
@@ -31,12 +32,23 @@ FAR = 1e30
 
 def stable_fraction(z: Tensor) -> Tensor:
     """The truncated normal's distribution function, relatively accurate however far out the limits are."""
-    return interval_fraction(z, z[..., -2:-1], z[..., -1:])
+    return interval_fraction(z, z[:, -2:-1], z[:, -1:])
 
 
 def fast_fraction(z: Tensor) -> Tensor:
     """The same by erf alone, good to about 1e-7 / (Phi(z(+)) - Phi(z(-)))."""
-    return erf_fraction(z, z[..., -2:-1], z[..., -1:])
+    return erf_fraction(z, z[:, -2:-1], z[:, -1:])
+
+
+class Cells(NamedTuple):
+    """What `cell_mass` returns."""
+
+    mass: Tensor
+    """[B, E - 1, C]: sum_s weight_sc (F_2(y_{j+1} | x_s) - F_2(y_j | x_s)), at least 0; columns keep sums."""
+    error: Tensor
+    """[B, C]: the largest doubt of a column, or what its negative masses add up to if that is more."""
+    cdf: Tensor
+    """[B, E, S]: F_2(y | x)."""
 
 
 class PlanarLayer(NamedTuple):
@@ -52,7 +64,8 @@ class PlanarLayer(NamedTuple):
 def marginal_cdf(spec: FlowSpec, theta: Tensor, x: Tensor, fraction: Fraction = stable_fraction) -> Tensor:
     """F_1 at x [B, K] under theta [B, P]: [B, K]."""
     location, _, stack = cut(spec, theta)
-    u = torch.cat([x - location, *_infinities(x)], dim=-1).unsqueeze(-2)
+    u = x - location
+    u = torch.cat([u, *_infinities(u[:, :1])], dim=-1).unsqueeze(-2)
     for layer in stack[:-1]:
         u = torch.tanh(layer.W_11 @ u + layer.B_1)
     z = (stack[-1].W_11 @ u + stack[-1].B_1).squeeze(-2)
@@ -62,33 +75,61 @@ def marginal_cdf(spec: FlowSpec, theta: Tensor, x: Tensor, fraction: Fraction = 
 def conditional_cdf(
     spec: FlowSpec, theta: Tensor, x: Tensor, y: Tensor, fraction: Fraction = stable_fraction
 ) -> Tensor:
-    """F_2(y | x) at x [B, S] and y [B, S, E] or [B, 1, E] under theta [B, P]: [B, S, E]."""
+    """F_2(y | x) at x [B, S] and y [B, S, E] under theta [B, P]: [B, S, E]."""
     m_1, m_2, stack = cut(spec, theta)
-    v = y - m_2.unsqueeze(-1)
-    h = torch.cat([v, *_infinities(v)], dim=-1).unsqueeze(-2)  # [B, S or 1, 1, E + 2]
+    v = (y - m_2.unsqueeze(-1)).transpose(-1, -2)
+    v = torch.cat([v, *_infinities(v[:, :1])], dim=1)  # [B, E + 2, S]
     contexts = second_contexts(stack, (x - m_1).unsqueeze(-2))
-    h = torch.tanh(stack[0].W_22.unsqueeze(1) * h + _columns(contexts[0]))
+    h = torch.tanh(stack[0].W_22.unsqueeze(-1) * v.unsqueeze(1) + contexts[0].unsqueeze(2))  # [B, H, E + 2, S]
     for layer, c in zip(stack[1:-1], contexts[1:-1], strict=True):
-        h = torch.tanh(layer.W_22.unsqueeze(1) @ h + _columns(c))
-    z = (stack[-1].W_22.unsqueeze(1) @ h + _columns(contexts[-1])).squeeze(-2)
+        h = torch.tanh(torch.unflatten(layer.W_22 @ h.flatten(2), 2, v.shape[1:]) + c.unsqueeze(2))
+    z = torch.unflatten(stack[-1].W_22 @ h.flatten(2), 2, v.shape[1:]).squeeze(1) + contexts[-1]
+    return _distribution(spec, z, fraction).transpose(-1, -2)
+
+
+def grid_cdf(spec: FlowSpec, theta: Tensor, x: Tensor, y: Tensor, fraction: Fraction = stable_fraction) -> Tensor:
+    """F_2(y | x) at every pair of x [B, S] and y [B, E] under theta [B, P]: [B, E, S]."""
+    m_1, m_2, stack = cut(spec, theta)
+    v = y - m_2
+    v = torch.cat([v, *_infinities(v[:, :1])], dim=-1)
+    contexts = second_contexts(stack, (x - m_1).unsqueeze(-2))
+    # W_22 v + c as one product with two terms: (v, 1) times (W_22 repeated along s, c), rows of H S numbers.
+    first = torch.stack([stack[0].W_22.expand_as(contexts[0]), contexts[0]], dim=1)
+    a = torch.stack([v, torch.ones_like(v)], dim=-1) @ first.flatten(2)
+    h = torch.tanh(torch.unflatten(a, -1, contexts[0].shape[1:]))  # [B, E + 2, H, S]
+    for layer, c in zip(stack[1:-1], contexts[1:-1], strict=True):
+        h = torch.tanh(layer.W_22.unsqueeze(1) @ h + c.unsqueeze(1))
+    z = (stack[-1].W_22.unsqueeze(1) @ h).squeeze(2) + contexts[-1]
     return _distribution(spec, z, fraction)
 
 
 def cell_mass(
-    spec: FlowSpec, theta: Tensor, x: Tensor, weight: Tensor, y: Tensor, fraction: Fraction = stable_fraction
-) -> Tensor:
-    """Masses of cells: sum_s weight_cs (F_2(y_{j+1} | x_s) - F_2(y_j | x_s)), [B, E - 1, C].
+    spec: FlowSpec,
+    theta: Tensor,
+    x: Tensor,
+    weight: Tensor,
+    doubt: Tensor,
+    y: Tensor,
+    fraction: Fraction = stable_fraction,
+) -> Cells:
+    """Masses of cells and what they may be wrong by.
 
     Args:
         theta: [B, P].
         x: [B, S], nodes (m).
-        weight: [B, C, S], what node s counts for in column c; a column's weights sum to its increment of F_1.
+        weight: [B, S, C], what node s counts for in column c; a column's weights sum to its increment of F_1.
+        doubt: [B, S, C], the weights minus those of a lesser rule: what cells would be wrong by under it.
         y: [B, E], cell edges, ascending (m).
         fraction: how F_2 follows from z_2 and its limits.
     """
-    F = conditional_cdf(spec, theta, x, y.unsqueeze(-2), fraction)
-    increments = torch.clamp(F[..., 1:] - F[..., :-1], min=0.0)  # [B, S, E - 1]
-    return increments.transpose(-1, -2) @ weight.transpose(-1, -2)
+    F = grid_cdf(spec, theta, x, y, fraction)
+    increments = torch.clamp(F[:, 1:] - F[:, :-1], min=0.0)  # [B, E - 1, S]
+    mass, off = increments @ weight, increments @ doubt
+    positive = torch.clamp(mass, min=0.0)
+    total, kept = mass.sum(1, keepdim=True), positive.sum(1, keepdim=True)
+    # Where weights of both signs made cells negative the others give way: columns keep their mass.
+    cells = positive * (torch.clamp(total, min=0.0) / torch.clamp(kept, min=1e-30))
+    return Cells(cells, torch.maximum(off.abs().amax(1), (kept - total).squeeze(1)), F)
 
 
 def cut(spec: FlowSpec, theta: Tensor) -> tuple[Tensor, Tensor, list[PlanarLayer]]:
@@ -111,16 +152,11 @@ def second_contexts(stack: list[PlanarLayer], u: Tensor) -> list[Tensor]:
     return [*contexts, stack[-1].W_21 @ u + stack[-1].B_2]
 
 
-def _columns(c: Tensor) -> Tensor:
-    """Contexts [B, H, S] as [B, S, H, 1], to be added along y."""
-    return c.transpose(-1, -2).unsqueeze(-1)
-
-
 def _distribution(spec: FlowSpec, z: Tensor, fraction: Fraction) -> Tensor:
-    """F [..., E] from z [..., E + 2], which ends with its limits."""
-    return cdf(z[..., :-2]) if spec.support == "paper" else fraction(z)[..., :-2]
+    """F [B, E, ...] from z [B, E + 2, ...], which ends with its limits along E."""
+    return cdf(z[:, :-2]) if spec.support == "paper" else fraction(z)[:, :-2]
 
 
 def _infinities(v: Tensor) -> tuple[Tensor, Tensor]:
-    far = torch.full_like(v[..., :1], FAR)
+    far = torch.full_like(v, FAR)
     return -far, far

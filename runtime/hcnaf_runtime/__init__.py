@@ -13,6 +13,11 @@ from hcnaf_runtime.encoder import Theta
 from hcnaf_runtime.forecaster import Forecaster
 from hcnaf_runtime.grid import Grid
 from hcnaf_runtime.maps import Maps, Timings
+from hcnaf_runtime.modes import Modes
+from hcnaf_runtime.occupancy import Occupancy
+from hcnaf_runtime.regions import Probability
+from hcnaf_runtime.risk import Risk
+from hcnaf_runtime.samples import Samples
 from hcnaf_runtime.scene import KINDS, Condition, Scene
 from hcnaf_runtime.verify import VerifyRow, verify
 
@@ -23,6 +28,11 @@ __all__ = [
     "Forecaster",
     "Grid",
     "Maps",
+    "Modes",
+    "Occupancy",
+    "Probability",
+    "Risk",
+    "Samples",
     "Scene",
     "Theta",
     "Timings",

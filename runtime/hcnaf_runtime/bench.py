@@ -21,9 +21,10 @@ from hcnaf_runtime.scene import Scene
 
 Float32 = npt.NDArray[np.float32]
 
-SECTIONS = ("hypernet", "dense", "certified", "forecast", "points", "memory")
+SECTIONS = ("hypernet", "dense", "certified", "forecast", "points", "samples", "risk", "memory")
 GRID = Grid(200, 200, 0.5)
-HORIZONS, AGENTS, POINTS = 20, 10, 100
+HORIZONS, AGENTS, POINTS, DRAWS = 20, 10, 100, 1000
+TRAJECTORIES, AT_RISK, EGO_SIZE = 200, 5, (4.6, 1.9)
 LOST_MASS = 1e-4
 SPACING = 4.0
 """How far copies of an agent stand from each other (m), across the scene's y."""
@@ -93,6 +94,8 @@ class Bench:
             "certified": self._certified,
             "forecast": self._forecast,
             "points": self._points,
+            "samples": self._samples,
+            "risk": self._risk,
         }
         for section, cases in makers.items():
             if section in sections:
@@ -154,13 +157,29 @@ class Bench:
         log_prob = partial(self.forecaster.log_prob, points=points, horizons=times)
         yield self._row("points", f"log_prob after theta, {asked}", 1, log_prob, scene)
 
-        def cdf(scene: Scene) -> tuple[Float32, Float32]:
-            theta = self.forecaster.theta(scene, times).values[0]
-            x, y = (np.broadcast_to(points[:, d], (len(theta), POINTS)) for d in (0, 1))
-            F_1 = self.forecaster.flow.marginal_cdf(theta, x)
-            return F_1, self.forecaster.flow.conditional_cdf(theta, x, y[..., None])
-
+        cdf = partial(self.forecaster.cdf, points=points, horizons=times)
         yield self._row("points", f"cdf after theta, {asked}", 1, cdf, scene)
+
+    def _samples(self) -> Iterator[Row]:
+        scene, times = crowd(self._first, 1), self.horizons(HORIZONS)
+        call = partial(self.forecaster.sample, n=DRAWS, horizons=times)
+        yield self._row("samples", f"{DRAWS} samples after theta, {_count(1, HORIZONS)}", 1, call, scene)
+
+    def _risk(self) -> Iterator[Row]:
+        """The first agent drives through the others: it is left out of them."""
+        times = self.horizons(HORIZONS)
+        scene = crowd(self._first, AT_RISK + 1)
+        others = replace(scene, target=scene.target[1:])
+        paths = fan(scene, int(scene.target[0]), np.array(times), TRAJECTORIES)
+        call = partial(
+            self.forecaster.collision_probability,
+            trajectories=paths,
+            ego_size=EGO_SIZE,
+            horizons=times,
+            exclude=(int(scene.target[0]),),
+        )
+        name = f"risk after theta, {TRAJECTORIES} trajectories, {_count(AT_RISK, HORIZONS)}"
+        yield self._row("risk", name, 1, call, others)
 
     def serve(self, count: int, seed: int = 0, every: int | None = None) -> Serving | None:
         """Forecast `count` scenes of changing size, certified; None where memory cannot be read.
@@ -191,6 +210,19 @@ class Bench:
         some = cut(crowd(scene, agents), int(rng.integers(1, 3)) / 2)
         timings = self.forecaster.pom(some, grid, times, lost_mass=LOST_MASS).timings
         return timings.hypernet + timings.maps
+
+
+def fan(scene: Scene, agent: int, times: npt.NDArray[Any], count: int) -> npt.NDArray[np.float64]:
+    """Arcs [count, T, 3] (x, y, yaw, scene frame) that an agent might drive from now on, at a tenth as many
+    curvatures as there are arcs, and speeds up to one and a half of its own."""
+    x, y, sin, cos, speed = scene.past[agent, -1].astype(np.float64)
+    speeds = np.linspace(0.0, 1.5, count // 10) * max(float(speed), 2.0)
+    curvature, v = (m.ravel()[:, None] for m in np.meshgrid(np.linspace(-0.1, 0.1, 10), speeds))
+    turn = curvature * v * times
+    reach = v * times * np.sinc(turn / (2.0 * np.pi))  # the chord
+    yaw = np.arctan2(sin, cos)
+    place = [x + reach * np.cos(yaw + turn / 2.0), y + reach * np.sin(yaw + turn / 2.0), yaw + turn]
+    return np.stack(np.broadcast_arrays(*place), axis=-1)
 
 
 def crowd(scene: Scene, agents: int) -> Scene:

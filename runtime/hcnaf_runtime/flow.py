@@ -1,15 +1,28 @@
 """The flow of a bundle as functions: its graphs, and densities at many points in bounded memory."""
 
-from typing import Any
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from itertools import pairwise
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from hcnaf_runtime.bundle import Bundle
-from hcnaf_runtime.cells import CHUNK, Distribution
+from hcnaf_runtime.errors import BundleError
+from hcnaf_runtime.manifest import GraphName
+from hcnaf_runtime.plane import CHUNK, Distribution
 from hcnaf_runtime.session import Settings
+from hcnaf_runtime.workers import Workers
 
 Float32 = npt.NDArray[np.float32]
+T = TypeVar("T")
+
+PART = CHUNK // 4
+"""Queries are cut into parts of about so many numbers in the widest intermediate."""
+
+DRAWS = 1 << 17
+"""Samples are drawn in parts of at most so many, times hidden units."""
 
 
 class Flow(Distribution):
@@ -17,7 +30,8 @@ class Flow(Distribution):
 
     def __init__(self, bundle: Bundle, settings: Settings) -> None:
         self._bundle = bundle
-        self._settings = settings
+        self._settings = replace(settings, threads=1)
+        self._workers = Workers(settings.threads)
 
     @property
     def dims(self) -> int:
@@ -31,31 +45,81 @@ class Flow(Distribution):
 
     def marginal_cdf(self, theta: Float32, x: Float32) -> Float32:
         """F_1 [B, K] at `x` [B, K] (m)."""
-        return self._run("marginal_cdf", "cdf", theta=theta, x=x)
+        return self._many("marginal_cdf", "cdf", theta, x=x)
 
     def conditional_cdf(self, theta: Float32, x: Float32, y: Float32) -> Float32:
         """F_2 [B, S, E] at `y` [B, S, E] given `x` [B, S] (m)."""
-        return self._run("conditional_cdf", "cdf", theta=theta, x=x, y=y)
+        return self._many("conditional_cdf", "cdf", theta, x=x, y=y)
 
-    def cell_mass(self, theta: Float32, x: Float32, weight: Float32, y: Float32) -> Float32:
-        """[B, E - 1, C]: sum over s of weight [B, C, S] times F_2's increments along y [E] given x [B, S]."""
-        return self._run("cell_mass", "mass", theta=theta, x=x, weight=weight, y=y)
+    def cell_mass(
+        self, theta: Float32, x: Float32, weight: Float32, doubt: Float32, y: Float32
+    ) -> tuple[Float32, Float32]:
+        """Mass [B, E - 1, C], the sum over s of weight [B, S, C] times F_2's increments along y [B, E] given x
+        [B, S]; and [B, C], the largest |sum| with the weights `doubt`, or what was below 0."""
+        mass, error = self._run("cell_mass", ["mass", "error"], theta=theta, x=x, weight=weight, doubt=doubt, y=y)
+        return mass, error
 
-    def log_prob(self, theta: Float32, points: Float32, chunk: int = CHUNK) -> Float32:
-        """log p [B, N] at `points` [B, N, D] (nats per m² for D = 2), in runs of `chunk` numbers."""
-        B, N, _ = points.shape
-        step = max(1, chunk // (self.hidden * self.dims))
-        if step >= B * N:
-            return self._run("flow", "log_prob", theta=theta, points=points)
-        result = np.empty((B, N), np.float32)
-        for b in range(B):
-            for n in range(0, N, step):
-                some = points[b : b + 1, n : n + step]
-                result[b, n : n + step] = self._run("flow", "log_prob", theta=theta[b : b + 1], points=some)[0]
-        return result
+    def grid_cdf(self, theta: Float32, x: Float32, y: Float32) -> Float32:
+        """F_2 [B, E, S] at every pair of `x` [B, S] and `y` [B, E] (m)."""
+        none = np.zeros((*x.shape, 1), np.float32)
+        return self._run("cell_mass", ["cdf"], theta=theta, x=x, weight=none, doubt=none, y=y)[0]
 
-    def _run(self, graph: Any, output: str, **feeds: Float32) -> Float32:
+    def log_prob(self, theta: Float32, points: Float32) -> Float32:
+        """log p [B, N] at `points` [B, N, D] (nats per m² for D = 2)."""
+        return self._many("flow", "log_prob", theta, points=points)
+
+    def inverse(self, theta: Float32, uniform: Float32) -> tuple[Float32, Float32]:
+        """The points [B, N, 2] (m) where F_1 and F_2 are `uniform` [B, N, 2], and log p [B, N] (nats per m²).
+
+        Raises BundleError where the bundle has no graph `inverse`.
+        """
+        if "inverse" not in self._bundle.manifest.graphs:
+            raise BundleError(f"{self._bundle.path}: no graph 'inverse', samples need it; export the bundle again")
+        B, N, D = uniform.shape
+        points, log_prob = np.empty((B, N, D), np.float32), np.empty((B, N), np.float32)
+        # Parts of a size that does not depend on the threads: the samples must not either.
+        most = max(1, DRAWS // self.hidden)
+        some = _parts(N, -(-N // most))
+        maps = _parts(B, -(-B // max(1, most // N)))
+
+        def part(key: tuple[slice, slice]) -> None:
+            found = self._run("inverse", ["points", "log_prob"], theta=theta[key[0]], uniform=uniform[key])
+            points[key], log_prob[key] = found
+
+        self.each(part, [(i, k) for i in maps for k in some])
+        return points, log_prob
+
+    def each(self, work: Callable[[T], object], items: Iterable[T]) -> None:
+        """Call `work` with each item, on as many threads as there are."""
+        self._workers.each(work, items)
+
+    def _many(self, graph: GraphName, output: str, theta: Float32, **feeds: Float32) -> Float32:
+        """One output [B, N, ...] for theta [B, P] and `feeds` [B, N, ...], part by part."""
+        B, N = next(iter(feeds.values())).shape[:2]
+        widest = max(value[0, 0].size for value in feeds.values()) if B * N else 1
+        # Small parts keep all threads busy; to a thread that is busy already they are a waste.
+        most = max(1, (CHUNK if self._workers.busy else PART) // (widest * self.hidden))
+        if most >= B * N:
+            return self._run(graph, [output], theta=theta, **feeds)[0]
+        # Even parts: of 5 maps in parts of at most 4, three and two.
+        maps = _parts(B, -(-B * N // most))
+        points = _parts(N, -(-N // most))
+        found: dict[tuple[int, int], Float32] = {}
+
+        def part(key: tuple[int, int]) -> None:
+            some = {name: value[maps[key[0]], points[key[1]]] for name, value in feeds.items()}
+            found[key] = self._run(graph, [output], theta=theta[maps[key[0]]], **some)[0]
+
+        self.each(part, [(i, k) for i in range(len(maps)) for k in range(len(points))])
+        rows = [np.concatenate([found[i, k] for k in range(len(points))], axis=1) for i in range(len(maps))]
+        return np.concatenate(rows)
+
+    def _run(self, graph: GraphName, outputs: list[str], **feeds: Float32) -> list[Float32]:
         session = self._bundle.session(graph, self._settings)
-        tensors = {name: np.ascontiguousarray(value) for name, value in feeds.items()}
-        result: Float32 = session.run([output], tensors)[0]
-        return result
+        return session.run(outputs, {name: np.ascontiguousarray(value) for name, value in feeds.items()})
+
+
+def _parts(size: int, count: int) -> list[slice]:
+    """`size` things in `count` even parts, or one part each if there are fewer."""
+    cuts = np.linspace(0, size, min(size, count) + 1).astype(int).tolist()
+    return [slice(a, b) for a, b in pairwise(cuts)]

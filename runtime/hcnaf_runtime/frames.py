@@ -5,8 +5,8 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from hcnaf_runtime.cells import Window
 from hcnaf_runtime.grid import Grid
+from hcnaf_runtime.plane import Window
 
 Float32 = npt.NDArray[np.float32]
 Float64 = npt.NDArray[np.float64]

@@ -18,8 +18,8 @@ OLDEST_FORMAT = 1
 """The oldest format this release reads."""
 FILE = "manifest.json"
 
-GraphName = Literal["hypernet", "flow", "marginal_cdf", "conditional_cdf", "cell_mass", "forecast"]
-"""The graphs a bundle may hold; the last four exist for two-dimensional flows only, `forecast` for scenes only."""
+GraphName = Literal["hypernet", "flow", "marginal_cdf", "conditional_cdf", "cell_mass", "inverse", "forecast"]
+"""The graphs a bundle may hold; the last five exist for two-dimensional flows only, `forecast` for scenes only."""
 
 Precision = Literal["fp32", "fp16", "int8"]
 """What the hyper-network's weights are stored as; the flow is always float32."""

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from hcnaf_runtime import modes
 from hcnaf_runtime.npz import write_npz
 
 Float32 = npt.NDArray[np.float32]
@@ -78,3 +79,21 @@ class Maps:
         row, column = np.unravel_index(int(mass.argmax()), mass.shape)
         x, y = self.origin + (np.array([column, row]) + 0.5) * self.resolution
         return float(x), float(y), float(mass[row, column])
+
+    def modes(
+        self, agent: int, horizon: int, k: int | None = None, prominence: float = modes.PROMINENCE
+    ) -> modes.Modes:
+        """The `k` (None: all) modes of a map in `frame`, the heaviest first; by position in A and T.
+
+        A mode is a local maximum with the mass of all cells from which ascent leads to it: see `modes.modes`.
+        Raises InputError for a `k` or `prominence` out of range.
+        """
+        return modes.modes(self.mass[agent, horizon], self.origin, self.resolution, k, prominence)
+
+    def region(self, agent: int, horizon: int, level: float) -> tuple[npt.NDArray[np.bool_], float]:
+        """The smallest set of cells [rows, cols] with probability `level`, and the mass of its least likely cell.
+
+        What the window misses counts as outside: if `window_mass` is below `level`, the region is every cell and
+        the threshold 0. By position in A and T. Raises InputError for a level that is not between 0 and 1.
+        """
+        return modes.region(self.mass[agent, horizon], level)

@@ -52,6 +52,23 @@ class Rule:
         """[..., S]: the weights of the nodes for the values `F` [..., len(support)] of the distribution."""
         return (F[..., self._panel] @ self._derivative).reshape(*F.shape[:-1], self.size)
 
+    @cached_property
+    def spread(self) -> Float64:
+        """[S, S]: what each node of the weights takes from the values of g at the nodes: itself alone."""
+        return np.eye(self.size)
+
+    @cached_property
+    def doubt(self) -> Float64:
+        """[S, S]: `spread` minus the polynomial through all nodes of a panel but the second from either end, to
+        judge the error by."""
+        t = _gauss(self.order)[0]
+        fewer = np.delete(np.arange(self.order), [1, self.order - 2])
+        lesser = np.zeros((self.order, self.order))
+        for k, node in enumerate(fewer):
+            lesser[:, node] = _lagrange(t[fewer], k, t)
+        doubt: Float64 = np.asarray(np.kron(np.eye(self.panels), np.eye(self.order) - lesser), np.float64)
+        return doubt
+
     def misfit(self, F: Float64, at_checks: Float64) -> Float64:
         """[...]: how far P through `F` is from F's values `at_checks` at worst: is F resolved at all?"""
         P = (F[..., self._panel] @ self._midway).reshape(at_checks.shape)

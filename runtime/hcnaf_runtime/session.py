@@ -27,9 +27,10 @@ def default_threads() -> int:
 class Settings:
     """How a graph runs.
 
-    `threads` may be used by one run. With `spinning` they wait for the next run in a busy loop: the lowest
-    latency, for a CPU that has nothing else to do. `flush_denormals` makes numbers below 1e-38 zero, in the
-    graph and from then on in the thread that loaded it.
+    `threads` may be used by one run: all there are for the hyper-network, one for the flow's graphs, which run
+    side by side (see `workers`). With `spinning` they wait for the next run in a busy loop: the lowest latency,
+    for a CPU that has nothing else to do. `flush_denormals` makes numbers below 1e-38 zero, in the graph and from
+    then on in the thread that loaded it; the flow's graphs make none.
     """
 
     threads: int
@@ -75,6 +76,8 @@ def _options(onnxruntime: Any, settings: Settings) -> Any:
     options.inter_op_num_threads = 1
     options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
     options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_ENABLE_ALL
+    # A plan of memory is kept for every shape of inputs ever seen: with shapes that change it only grows.
+    options.enable_mem_pattern = False
     options.log_severity_level = 3  # errors only: everything that matters is raised
     # Threads that spin between calls take the CPU from whatever else runs on the vehicle.
     options.add_session_config_entry("session.intra_op.allow_spinning", str(int(settings.spinning)))

@@ -5,7 +5,6 @@ one wide map or from twenty narrow ones. Inside a batch everything is padded to 
 weighs nothing.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,25 +58,22 @@ def cut(wanted: Mask, width: int, *, gap: int = 0) -> Tiles:
     starts = np.flatnonzero(fresh)
     lengths = np.diff(starts, append=len(maps))
     pieces = -(-lengths // width)
-    # A run in n pieces is cut evenly: of 65 columns in tiles of 64, two of 33.
-    even = -(-lengths // pieces)
     rank = np.arange(pieces.sum()) - np.repeat(np.cumsum(pieces) - pieces, pieces)
-    first = np.repeat(starts, pieces) + rank * np.repeat(even, pieces)
-    count = np.minimum(np.repeat(even, pieces), np.repeat(starts + lengths, pieces) - first)
+    first = np.repeat(starts, pieces) + rank * width
+    count = np.minimum(width, np.repeat(starts + lengths, pieces) - first)
     index = first[:, None] + np.minimum(np.arange(count.max()), count[:, None] - 1)
     return Tiles(maps[first], columns[index], count)
 
 
-def batches(sizes: Indices, others: Indices, budget: int) -> Iterator[Indices]:
-    """Groups of items, alike in `sizes` and `others`, with number * max size * max other within `budget`."""
-    order = np.lexsort((others, sizes))
-    start = 0
-    while start < len(order):
-        wide, tall, stop = int(sizes[order[start]]), int(others[order[start]]), start + 1
-        while stop < len(order):
-            wider, taller = max(wide, int(sizes[order[stop]])), max(tall, int(others[order[stop]]))
-            if wider * taller * (stop + 1 - start) > budget:
-                break
-            wide, tall, stop = wider, taller, stop + 1
-        yield order[start:stop]
-        start = stop
+def batches(sizes: Indices, budget: int, waste: int | None = None) -> list[Indices]:
+    """Groups of items, alike in `sizes` [n]: number * largest size is within `budget`, and what the others lack of
+    the largest adds up to at most `waste`, if that is given."""
+    order = np.argsort(sizes, kind="stable")
+    groups, start, total = [], 0, 0
+    for stop, size in enumerate(sizes[order].tolist()):
+        padded = size * (stop + 1 - start)
+        if stop > start and (padded > budget or (waste is not None and padded - total - size > waste)):
+            groups.append(order[start:stop])
+            start, total = stop, 0
+        total += size
+    return [*groups, order[start:]] if len(order) else []

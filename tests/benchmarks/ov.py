@@ -20,8 +20,8 @@ def feeds(density: Density, graph: str) -> tuple[Feeds, str]:
     grid = window()
     x = (grid.x_edges[1:] + grid.x_edges[:-1]) / 2
     increments = np.diff(density.forecaster.flow.marginal_cdf(theta, grid.x_edges[None])[0])
-    y = grid.y_edges[None]
-    return {"theta": theta, "x": x[None], "weight": np.diag(increments)[None], "y": y}, "mass"
+    weight, y = np.diag(increments)[None], grid.y_edges[None]
+    return {"theta": theta, "x": x[None], "weight": weight, "doubt": 0.0 * weight, "y": y}, "mass"
 
 
 def in_onnxruntime(density: Density, graph: Any) -> Callable[[], Any]:

@@ -169,7 +169,8 @@ def measure_graphs(setting: Setting) -> Json:
 
 def measure_vehicle(setting: Setting) -> Json:
     """`hcnaf-run bench` on the bundle, in a process without PyTorch; longer than others, for the sake of p99."""
-    return _hcnaf_run(setting, "hypernet,dense,certified,forecast,points", f"--seconds={3 * setting.seconds}")
+    sections = "hypernet,dense,certified,forecast,points,samples,risk"
+    return _hcnaf_run(setting, sections, f"--seconds={3 * setting.seconds}")
 
 
 def measure_memory(setting: Setting) -> Json:

@@ -97,5 +97,7 @@ TARGETS = (
     Target("against the fastest of NSF, MAF, nflows", "times", 30.0, "19", lambda r: _peer(r, PEERS), True),
     Target("resident memory while serving", "MiB", 150.0, "-", lambda r: r["memory"]["memory"]["peak"] / 2**20),
     Target("its growth over the second half", "MiB", 2.0, "-", lambda r: r["memory"]["memory"]["growth"] / 2**20),
+    Target("1,000 samples x 20 horizons after theta", "ms", 30.0, "-", lambda r: _median(r, "samples", "")),
+    Target("risk, 200 trajectories x 20 x 5 agents", "ms", 50.0, "-", lambda r: _median(r, "risk", "")),
     Target("p99 / median, whole forecasts", "", 1.5, "-", _tail),
 )

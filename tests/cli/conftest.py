@@ -43,7 +43,9 @@ def make_bundle(folder):
         "theta": theta,
         "points": rng.normal(size=(2, 3, 2)).astype(np.float32),
         "x": rng.normal(size=(2, 4)).astype(np.float32),
-        "weight": np.ones((2, 1, 4), np.float32),
+        "uniform": np.float32([[[0.2, 0.7], [0.5, 0.01]], [[0.9, 0.4], [0.999, 0.6]]]),
+        "weight": np.ones((2, 4, 1), np.float32),
+        "doubt": np.ones((2, 4, 1), np.float32),
     }
     golden = {}
     for name in bundle.manifest.graphs:

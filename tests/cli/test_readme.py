@@ -41,14 +41,19 @@ def test_two_commands_need_nothing_else():
     assert "^python3" in (ROOT / ".ci" / "run").read_text(encoding="utf-8")
 
 
-def test_the_python_example_runs(embedded, scene_path, tmp_path, monkeypatch):
-    (example,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+def test_the_python_examples_run(embedded, scene_path, tmp_path, monkeypatch):
+    examples = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+    assert len(examples) == 2
     scene_path.rename(tmp_path / "scene.npz")
     monkeypatch.chdir(tmp_path)
     names = {}
-    exec(example, names)
+    for example in examples:
+        exec(example, names)
     assert names["maps"].mass.shape == (2, 3, 200, 200)
     assert names["log_p"].shape == (2, 3, 1)
+    assert names["paths"].points.shape == (2, 3, 100, 2)
+    assert names["anybody"].probability.shape == (3, 200, 200)
+    assert names["risk"].per_step.shape == (1, 3)
 
 
 def test_links_lead_somewhere():

@@ -1,4 +1,5 @@
 import json
+import re
 
 import numpy as np
 import pytest
@@ -120,7 +121,7 @@ def test_verify_fails_with_1(run, own_bundle):
     np.savez(own_bundle / "golden.npz", **golden)
     result = run("verify", own_bundle)
     assert result.exit_code == 1
-    assert "1 of 8 outputs differ" in result.stderr
+    assert re.search(r"1 of \d+ outputs differ", result.stderr)
     assert len(result.stderr.splitlines()) == 1
     assert "FAILED" in result.stdout
     assert json.loads(run("verify", own_bundle, "--json").stdout)["passed"] is False

@@ -47,7 +47,8 @@ def test_a_bundle_opens_and_verifies(pom, line, space):
 def test_files_of_a_bundle(pom, line):
     flow_only = {"hypernet.onnx", "flow.onnx", "golden.npz", "manifest.json", "README.md"}
     assert {f.name for f in line.path.iterdir()} == flow_only
-    planar_graphs = {"marginal_cdf.onnx", "conditional_cdf.onnx", "cell_mass.onnx", "forecast.onnx"}
+    planar_graphs = {"marginal_cdf.onnx", "conditional_cdf.onnx", "cell_mass.onnx", "inverse.onnx"}
+    planar_graphs |= {"forecast.onnx"}
     assert {f.name for f in pom.path.iterdir()} == flow_only | planar_graphs
     assert pom.result.bytes == sum(f.stat().st_size for f in pom.path.iterdir())
     assert list(pom.path.parent.iterdir()) == [pom.path]
@@ -133,12 +134,12 @@ def test_forecast_maps_are_those_of_pytorch(pom):
     S = 400  # mid-points per column: fine enough to be a reference in float64
     edges = torch.linspace(-4.0, 20.0, 12 * S + 1, dtype=torch.float64)
     F = planar.marginal_cdf(spec, theta, edges[None])[0]
-    weight = torch.zeros(1, 12, 12 * S, dtype=torch.float64)
+    weight = torch.zeros(1, 12 * S, 12, dtype=torch.float64)
     for c in range(12):
-        weight[0, c, c * S : (c + 1) * S] = (F[1:] - F[:-1])[c * S : (c + 1) * S]
+        weight[0, c * S : (c + 1) * S, c] = (F[1:] - F[:-1])[c * S : (c + 1) * S]
     middle = (edges[1:] + edges[:-1]) / 2
     y = torch.linspace(-10.0, 10.0, 11, dtype=torch.float64)
-    expected = planar.cell_mass(spec, theta, middle[None], weight, y[None])[0].numpy()
+    expected = planar.cell_mass(spec, theta, middle[None], weight, 0.0 * weight, y[None]).mass[0].numpy()
     assert maps.mass[0, 0].sum() > 0.05
     np.testing.assert_allclose(maps.mass[0, 0], expected, atol=5e-6)
 

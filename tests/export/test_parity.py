@@ -78,6 +78,14 @@ def test_probes_reach_tails_and_stay_finite(name):
         assert all(np.isfinite(v).all() for v in parity.run_torch(graph, feeds))
 
 
+def test_probes_of_the_inverse_are_where_it_is_defined():
+    spec = FlowSpec(layers=2, hidden=20)
+    cases = flow_cases("inverse", spec, {})
+    assert {"random", "single", "sharp", "wide"} == set(cases)
+    for feeds in cases.values():
+        assert ((feeds["uniform"] > 0.0) & (feeds["uniform"] < 1.0)).all()
+
+
 def test_the_path_from_condition_to_density_is_compared(space):
     rows = compare(space.model, graphs(space.model), space.path)
     assert [(r.graph, r.output) for r in rows] == [

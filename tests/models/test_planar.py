@@ -40,12 +40,14 @@ def masses(spec, theta, edges, parts=512):
     fine = columns(edges, parts)
     F = planar.marginal_cdf(spec, theta[None], fine[None])[0]
     count = len(edges) - 1
-    weight = torch.zeros(1, count, count * parts, dtype=torch.float64)
+    weight = torch.zeros(1, count * parts, count, dtype=torch.float64)
     for c in range(count):
-        weight[0, c, c * parts : (c + 1) * parts] = (F[1:] - F[:-1])[c * parts : (c + 1) * parts]
+        weight[0, c * parts : (c + 1) * parts, c] = (F[1:] - F[:-1])[c * parts : (c + 1) * parts]
     nodes = 0.5 * (fine[1:] + fine[:-1])
     y = torch.tensor(edges, dtype=torch.float64)
-    return planar.cell_mass(spec, theta[None], nodes[None], weight, y[None])[0], F, nodes, y
+    found = planar.cell_mass(spec, theta[None], nodes[None], weight, weight, y[None])
+    torch.testing.assert_close(found.error[0], found.mass[0].amax(0), rtol=0, atol=1e-12)
+    return found.mass[0], F, nodes, y
 
 
 @pytest.mark.parametrize("spec", SPECS, ids=name)
@@ -66,9 +68,9 @@ def test_columns_telescope(spec):
     mass, F, nodes, _ = masses(spec, theta, edges, parts=3)
     increments = (F[1:] - F[:-1]).reshape(-1, 3)
     if spec.support == "paper":
-        ends = torch.tensor([[[-1e5, 1e5]]], dtype=torch.float64)
-        top = planar.conditional_cdf(spec, theta[None], nodes[None], ends)
-        increments = increments * (top[0, :, 1] - top[0, :, 0]).reshape(-1, 3)
+        ends = torch.tensor([[-1e5, 1e5]], dtype=torch.float64)
+        top = planar.grid_cdf(spec, theta[None], nodes[None], ends)
+        increments = increments * (top[0, 1] - top[0, 0]).reshape(-1, 3)
     torch.testing.assert_close(mass.sum(0), increments.sum(1), rtol=0, atol=1e-9)
 
 
@@ -86,14 +88,28 @@ def test_marginal_cdf_is_the_integral_of_the_marginal(spec):
     assert float(F[1] - F[0]) == pytest.approx(expected, abs=1e-6)
 
 
-def test_conditional_cdf_takes_edges_shared_or_per_column():
+def test_a_grid_is_its_points():
     spec = SPECS[0]
     theta = torch.stack([random_theta(spec, s) for s in (1, 2)])
     x, y = torch.randn(2, 5, dtype=torch.float64), torch.linspace(-3, 3, 7, dtype=torch.float64)
-    shared = planar.conditional_cdf(spec, theta, x, y.expand(2, 1, 7))
-    own = planar.conditional_cdf(spec, theta, x, y.expand(2, 5, 7))
-    torch.testing.assert_close(shared, own, rtol=0, atol=1e-14)
-    assert shared.shape == (2, 5, 7)
+    grid = planar.grid_cdf(spec, theta, x, y.expand(2, 7))
+    points = planar.conditional_cdf(spec, theta, x, y.expand(2, 5, 7))
+    torch.testing.assert_close(grid.transpose(1, 2), points, rtol=0, atol=1e-14)
+    assert grid.shape == (2, 7, 5)
+
+
+def test_columns_keep_their_mass_where_weights_of_both_signs_make_cells_negative():
+    spec = SPECS[0]
+    theta = random_theta(spec, 15, scale=1.0)
+    x, y = torch.tensor([[-1.0, 0.0, 1.0]], dtype=torch.float64), torch.linspace(-6, 6, 60, dtype=torch.float64)
+    weight = torch.tensor([[[-0.3], [1.6], [-0.3]]], dtype=torch.float64)
+    found = planar.cell_mass(spec, theta[None], x, weight, 0.0 * weight, y[None])
+    F = planar.grid_cdf(spec, theta[None], x, y[None])
+    raw = (F[:, 1:] - F[:, :-1]) @ weight
+    assert raw.min() < -1e-4
+    assert found.mass.min() >= 0
+    torch.testing.assert_close(found.mass.sum(1), raw.sum(1), rtol=0, atol=1e-12)
+    torch.testing.assert_close(found.error[0, 0], -raw.clamp(max=0).sum(), rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("spec", SPECS, ids=name)

@@ -51,25 +51,85 @@ def _phi(value: str, scale: str, out: str) -> str:
 """
 
 
+def _polynomial(variable: str, coefficients: list[float], out: str) -> str:
+    """Horner's scheme; coefficients descend."""
+    lines = [f"{out}_0 = Constant<value = float {{{coefficients[0]}}}>()"]
+    for k, c in enumerate(coefficients[1:], start=1):
+        lines.append(f"{out}_c{k} = Constant<value = float {{{c}}}>()")
+        lines.append(f"{out}_m{k} = Mul({out}_{k - 1}, {variable})")
+        lines.append(f"{out}_{k} = Add({out}_m{k}, {out}_c{k})")
+    lines.append(f"{out} = Identity({out}_{len(coefficients) - 1})")
+    return "\n    ".join(lines)
+
+
+_PPND7_CENTRE = (
+    [59.109374720, 159.29113202, 50.434271938, 3.3871327179],
+    [67.187563600, 78.757757664, 17.895169469, 1.0],
+)
+_PPND7_TAIL = (
+    [0.17023821103, 1.3067284816, 2.7568153900, 1.4234372777],
+    [0.12021132975, 0.73700164250, 1.0],
+)
+
+
+def _quantile(u: str, out: str) -> str:
+    """Phi^-1 of `u` in [1e-11, 1): Wichura's PPND7 (Algorithm AS 241, 1988)."""
+    above, below = _PPND7_CENTRE
+    outer, under = _PPND7_TAIL
+    return f"""
+    {out}_q = Sub({u}, half)
+    {out}_q2 = Mul({out}_q, {out}_q)
+    {out}_w = Constant<value = float {{0.180625}}>()
+    {out}_r = Sub({out}_w, {out}_q2)
+    {_polynomial(f"{out}_r", above, f"{out}_ca")}
+    {_polynomial(f"{out}_r", below, f"{out}_cb")}
+    {out}_cr = Div({out}_ca, {out}_cb)
+    {out}_inner = Mul({out}_q, {out}_cr)
+    {out}_v = Sub(unit, {u})
+    {out}_p = Min({u}, {out}_v)
+    {out}_l = Log({out}_p)
+    {out}_n = Neg({out}_l)
+    {out}_s = Sqrt({out}_n)
+    {out}_k = Constant<value = float {{1.6}}>()
+    {out}_t = Sub({out}_s, {out}_k)
+    {_polynomial(f"{out}_t", outer, f"{out}_ta")}
+    {_polynomial(f"{out}_t", under, f"{out}_tb")}
+    {out}_tr = Div({out}_ta, {out}_tb)
+    {out}_side = Sign({out}_q)
+    {out}_outer = Mul({out}_side, {out}_tr)
+    {out}_size = Abs({out}_q)
+    {out}_edge = Constant<value = float {{0.425}}>()
+    {out}_near = LessOrEqual({out}_size, {out}_edge)
+    {out} = Where({out}_near, {out}_inner, {out}_outer)
+"""
+
+
 GRAPHS = {
     "marginal_cdf": f"""g (float[B,P] theta, float[B,K] x) => (float[B,K] cdf) {{{_PARTS}
     dx = Sub(x, mx) {_phi("dx", "sx", "cdf")} }}""",
     "conditional_cdf": f"""g (float[B,P] theta, float[B,S] x, float[B,S,E] y) => (float[B,S,E] cdf) {{
     {_PARTS}{_CONDITIONAL}
     dy = Sub(y, m2e) {_phi("dy", "s2e", "cdf")} }}""",
-    "cell_mass": f"""g (float[B,P] theta, float[B,S] x, float[B,C,S] weight, float[B,E] y)
-    => (float[B,R,C] mass) {{
+    "cell_mass": f"""g (float[B,P] theta, float[B,S] x, float[B,S,C] weight, float[B,S,C] doubt, float[B,E] y)
+    => (float[B,R,C] mass, float[B,C] error, float[B,E,S] cdf) {{
     {_PARTS}{_CONDITIONAL}
+    rows = Unsqueeze(y, last)
     middle = Constant<value_ints = [1]>()
-    rows = Unsqueeze(y, middle)
-    dy = Sub(rows, m2e) {_phi("dy", "s2e", "cdf")}
-    two = Constant<value_ints = [2]>()
+    m2s = Unsqueeze(m2, middle)
+    s2s = Unsqueeze(s2, middle)
+    dy = Sub(rows, m2s) {_phi("dy", "s2s", "cdf")}
     end = Constant<value_ints = [9223372036854775807]>()
-    upper = Slice(cdf, one, end, two)
-    lower = Slice(cdf, zero, last, two)
+    upper = Slice(cdf, one, end, one)
+    lower = Slice(cdf, zero, last, one)
     step = Sub(upper, lower)
-    columns = MatMul(weight, step)
-    mass = Transpose<perm = [0, 2, 1]>(columns) }}""",
+    raw = MatMul(step, weight)
+    mass = Relu(raw)
+    off = MatMul(step, doubt)
+    size = Abs(off)
+    largest = ReduceMax<keepdims = 0>(size, one)
+    below = Sub(mass, raw)
+    negative = ReduceSum<keepdims = 0>(below, one)
+    error = Max(largest, negative) }}""",
     "flow": f"""g (float[B,P] theta, float[B,N,2] points)
     => (float[B,N] log_prob, float[B,N,2] z, float[B,N] log_det) {{
     {_PARTS}
@@ -99,6 +159,33 @@ GRAPHS = {
     c = Constant<value = float {{1.8378770664}}>()
     lp = Sub(log_det, hq)
     log_prob = Sub(lp, c) }}""",
+    "inverse": f"""g (float[B,P] theta, float[B,M,2] uniform)
+    => (float[B,M,2] points, float[B,M] log_prob) {{
+    {_PARTS}
+    two = Constant<value_ints = [2]>()
+    halves = Constant<value_ints = [1, 1]>()
+    ue, ve = Split<axis = 2>(uniform, halves)
+    u = Squeeze(ue, two)
+    v = Squeeze(ve, two) {_quantile("u", "z1")} {_quantile("v", "z2")}
+    dx = Mul(z1, sx)
+    x = Add(mx, dx)
+    lean = Mul(slope, dx)
+    m2 = Add(my, lean)
+    dy = Mul(z2, s2)
+    y = Add(m2, dy)
+    xe = Unsqueeze(x, two)
+    ye = Unsqueeze(y, two)
+    points = Concat<axis = 2>(xe, ye)
+    area = Mul(sx, s2)
+    log_area = Log(area)
+    q1 = Mul(z1, z1)
+    q2 = Mul(z2, z2)
+    q = Add(q1, q2)
+    hq = Mul(half, q)
+    c = Constant<value = float {{1.8378770664}}>()
+    whole = Add(hq, c)
+    loss = Add(whole, log_area)
+    log_prob = Neg(loss) }}""",
 }
 
 HYPERNET = """g (float[N,R,5] past, int64[A] target, int8[C,H,W] raster, float[T] horizons)

@@ -127,8 +127,10 @@ def _write_golden(folder):
             "theta": theta,
             "x": np.float32([[0]]),
             "weight": np.float32([[[1]]]),
+            "doubt": np.float32([[[1]]]),
             "y": np.float32([[0, 1]]),
         },
+        "inverse": {"theta": theta, "uniform": np.float32([[[0.3, 0.6]]])},
         "hypernet": {
             "past": np.ones((1, 3, 5), np.float32),
             "target": np.zeros(1, np.int64),

@@ -57,3 +57,13 @@ def test_a_spike_between_the_nodes_is_noticed(centre):
         assert rule.misfit(F, checks) > 1e-2
     smooth, at_checks = (norm.cdf(t, centre, 2.0) for t in (RULES[-1].support, RULES[-1].checks))
     assert RULES[-1].misfit(smooth, at_checks) < 1e-12
+
+
+@pytest.mark.parametrize("rule", [Rule(1, 5), Rule(1, 7), Rule(4, 7)])
+def test_doubt_vanishes_for_polynomials_and_not_for_a_step(rule):
+    """Also where F is even: a mode that integrates to nothing must not hide the step that it is part of."""
+    t = rule.support[rule.nodes]
+    weights = rule.weights(rule.support) @ rule.doubt
+    assert abs(weights @ t ** (rule.order - 3)) < 1e-12
+    for place in (0.31, 0.47, 0.78):
+        assert abs(weights @ (t > place)) > 1e-3 / rule.panels

@@ -1,0 +1,191 @@
+"""Which columns of a window are computed, and from how many nodes.
+
+    F_1 at all edges --> columns with mass --> one node in each (Halo) --> columns in doubt --> more nodes (RULES)
+
+Columns of all maps are pooled in tiles, and tiles in batches of bounded size.
+"""
+
+import numpy as np
+import numpy.typing as npt
+
+from hcnaf_runtime.plane import Distribution, Window
+from hcnaf_runtime.quadrature import Halo, Rule
+from hcnaf_runtime.tile_rows import Canvas, Found, Nodes, TileRows
+from hcnaf_runtime.tiles import Tiles, batches, cut
+
+Float32 = npt.NDArray[np.float32]
+Float64 = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.intp]
+Mask = npt.NDArray[np.bool_]
+HALO = Halo(2, Rule(1, 2))
+"""The first try: the centre of every column, and two neighbours on either side."""
+
+RULES = tuple(Rule(2**k, 7) for k in range(7))
+"""Rules tried in turn where the first try is in doubt; the last one has 448 nodes per column."""
+
+HOPELESS = 8
+"""From so many panels on a column must gain by a rule to be tried with the next."""
+
+WIDTH = 44
+"""Most columns in a tile, and most nodes in one where each column has several."""
+
+BATCH = 4096
+"""Most nodes in the tiles that are looked at together."""
+
+NEGLIGIBLE = 1e-9
+"""Columns with less mass are left empty; thousands of them do not add up to what float32 resolves near 1."""
+
+SATURATED = 1e-9, 1.5e-7
+"""What float32 resolves near 0 and near 1: F_2 this close to its value at the window's edge is flat up to it."""
+
+RESOLVED = 1e-3
+"""A rule's nodes may miss F_1 by this share of a column's mass. A spike between two nodes misses it by far
+more, and would otherwise pass for converged, since no rule sees it; accuracy itself is judged by the cells."""
+
+MARGIN = 2
+"""Rows more that a column in doubt gets on either side."""
+
+
+class Columns:
+    """Maps being filled, with what is known of each column [B, C]: its share of the mass, its error, and what of
+    it is inside and outside of the rows computed."""
+
+    def __init__(
+        self,
+        flow: Distribution,
+        theta: Float32,
+        window: Window,
+        mass: Float32,
+        tolerance: float,
+        lost_mass: float,
+        chunk: int,
+    ) -> None:
+        self.flow, self.theta, self.window = flow, theta, window
+        self.tolerance, self.lost_mass = tolerance, lost_mass
+        # Either end of a tile's columns may lose a quarter, the columns left out a half: together lost_mass.
+        ends = max(lost_mass / 4.0, SATURATED[0]), max(lost_mass / 4.0, SATURATED[1])
+        self.canvas = Canvas(flow, theta, window, mass, ends, chunk)
+
+    def run(self) -> None:
+        """Fill the maps."""
+        self._begin()
+        tiles = cut(self.kept, WIDTH, gap=2 * HALO.reach)
+        for some in batches(tiles.count + 2 * HALO.reach, BATCH):
+            self._centres(tiles.some(some))
+        pending = self.error > self.goal
+        for rule in RULES:
+            if not pending.any():
+                break
+            before = self.error.copy()
+            tiles = cut(pending, max(1, WIDTH // rule.size))
+            for some in batches(tiles.count * rule.size, BATCH):
+                self._refine(rule, tiles.some(some))
+            pending &= self.error > self.goal
+            if rule.panels >= HOPELESS:  # such as the rounding of F_2
+                pending &= (self.error < 0.9 * before) | (self.error >= self.share)
+
+    def _begin(self) -> None:
+        """What F_1 tells: the columns' shares, and which of them to keep."""
+        edges = np.broadcast_to(self.window.x, (len(self.theta), len(self.window.x)))
+        self.cdf = self.flow.marginal_cdf(self.theta, edges).astype(np.float64)
+        self.share = np.maximum(np.diff(self.cdf, axis=1), 0.0)
+        self.kept = _kept(self.share, self.lost_mass / 2.0)
+        self.goal = np.maximum(self.tolerance, _noise(self.window.x) * self.share)
+        self.error = np.where(self.kept, 0.0, self.share if self.lost_mass == 0.0 else 0.0)
+        # A column more than there are takes what belongs to padding.
+        self.inside = np.zeros(self.cdf.shape)
+        self.outside = np.pad(np.where(self.kept, 0.0, self.share), ((0, 0), (0, 1)))
+
+    def _centres(self, tile: Tiles) -> None:
+        """One node per column."""
+        reach, w = HALO.reach, tile.columns.shape[1]
+        left = float(self.window.x[0])
+        pitch = (float(self.window.x[-1]) - left) / (len(self.window.x) - 1)
+        weights, misfit = self._weights(tile, HALO.rule)
+        first = tile.columns[:, :1] - reach + np.arange(w + 2 * reach)
+        weight = np.zeros((2, len(tile), w + 2 * reach, w), np.float32)
+        column = np.arange(w)
+        for k in range(2 * reach + 1):
+            weight[0, :, column + k, column] = (weights @ HALO.spread[:, k]).T
+            weight[1, :, column + k, column] = (weights @ HALO.doubt[:, k]).T
+        x = (left + (first + 0.5) * pitch).astype(np.float32)
+        nodes = Nodes(x, weight[0], weight[1], tile.count + 2 * reach)
+        self._note(tile, self._rows(tile, nodes).fill(), misfit)
+
+    def _refine(self, rule: Rule, tile: Tiles) -> None:
+        """Several nodes in each column."""
+        J, w = tile.columns.shape
+        weights, misfit = self._weights(tile, rule)
+        x = self._places(tile, rule.support[rule.nodes]).reshape(J, -1)
+        weight = np.zeros((2, J, w, rule.size, w), np.float32)
+        column = np.arange(w)
+        weight[0, :, column, :, column] = weights.transpose(1, 0, 2)
+        weight[1, :, column, :, column] = (weights @ rule.doubt).transpose(1, 0, 2)
+        flat = weight.reshape(2, J, -1, w)
+        nodes = Nodes(x, flat[0], flat[1], tile.count * rule.size)
+        low, high = self._held(tile)
+        self.canvas.mass[tile.maps[:, None], :, tile.columns] = 0.0
+        found = self._rows(tile, nodes).fill_rows(low, high, np.arange(J))
+        unresolved = misfit > np.maximum(RESOLVED * self._of(self.share, tile), self._of(self.goal, tile))
+        self._note(tile, found, np.where(unresolved, np.inf, 0.0))
+
+    def _rows(self, tile: Tiles, nodes: Nodes) -> TileRows:
+        return TileRows(self.canvas, tile, nodes, self._of(self.share, tile), self._of(self.goal, tile))
+
+    def _held(self, tile: Tiles) -> tuple[Indices, Indices]:
+        """The rows `low` to `high` [J] that hold anything, by what is there now, and MARGIN more."""
+        below = np.cumsum(self.canvas.mass[tile.maps[:, None], :, tile.columns], axis=-1)  # [J, w, R]
+        share = self._of(self.share, tile)[..., None]
+        empty = np.count_nonzero(below <= self.canvas.ends[0] * share, axis=-1)
+        full = np.count_nonzero(below >= below[..., -1:] - self.canvas.ends[1] * share, axis=-1)
+        low = np.maximum(empty.min(axis=1) - MARGIN, 0)
+        high = np.minimum(self.canvas.rows - full.min(axis=1) + 1 + MARGIN, self.canvas.rows)
+        return low, np.maximum(high, low)
+
+    def _of(self, values: Float64, tile: Tiles) -> Float64:
+        """What is known of a tile's columns, [J, w]."""
+        return values[tile.maps[:, None], tile.columns]
+
+    def _weights(self, tile: Tiles, rule: Rule) -> tuple[Float64, Float64]:
+        """Weights [J, w, S] of the rule's nodes in each column, zero in padding, and its misfit of F_1 [J, w]."""
+        n = len(rule.support) - 2
+        x = self._places(tile, np.concatenate([rule.support[1:-1], rule.checks]))
+        found = self.flow.marginal_cdf(self.theta[tile.maps], x.reshape(len(tile), -1))
+        cdf = found.astype(np.float64).reshape(x.shape)
+        left, right = (self.cdf[tile.maps[:, None], tile.columns + side][..., None] for side in (0, 1))
+        F = np.concatenate([left, cdf[..., :n], right], axis=-1)
+        return rule.weights(F) * tile.own[:, :, None], rule.misfit(F, cdf[..., n:])
+
+    def _places(self, tile: Tiles, share: Float64) -> Float32:
+        """Points [J, w, n] at these shares [n] of the way from each column's left edge to its right."""
+        left = self.window.x[tile.columns].astype(np.float64)[..., None]
+        right = self.window.x[tile.columns + 1].astype(np.float64)[..., None]
+        return (left + (right - left) * share).astype(np.float32)
+
+    def _note(self, tile: Tiles, found: Found, unsure: Float64) -> None:
+        """Note what was found in a tile's columns, and errors with what else is `unsure` [J, w]: none is wrong by
+        more than it holds."""
+        maps, columns = tile.maps[:, None], np.where(tile.own, tile.columns, len(self.window.x) - 1)
+        self.inside[maps, columns] = found.inside
+        self.outside[maps, columns] = found.outside
+        own = tile.own
+        maps = np.broadcast_to(maps, own.shape)[own]
+        columns = columns[own]
+        error = np.maximum(found.error, unsure)[own]
+        self.error[maps, columns] = np.minimum(error, self.share[maps, columns])
+
+
+def _kept(share: Float64, budget: float) -> Mask:
+    """Columns [B, C] to compute: all but the smallest, which together hold at most `budget` per map."""
+    ascending = np.sort(share, axis=1)
+    dropped = np.count_nonzero(np.cumsum(ascending, axis=1) <= budget, axis=1)
+    threshold = np.take_along_axis(ascending, np.maximum(dropped - 1, 0)[:, None], axis=1)
+    threshold = np.where(dropped[:, None] > 0, threshold, 0.0)
+    return np.asarray(share > np.maximum(threshold, NEGLIGIBLE))
+
+
+def _noise(x: Float32) -> Float64:
+    """[C]: what rounding x to float32 changes in F_1, in units of a column's mass; no rule sees past it."""
+    edges = x.astype(np.float64)
+    reach = np.maximum(np.abs(edges[:-1]), np.abs(edges[1:]))
+    return np.finfo(np.float32).eps * reach / np.diff(edges)
