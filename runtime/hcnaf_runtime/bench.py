@@ -166,20 +166,19 @@ class Bench:
         yield self._row("samples", f"{DRAWS} samples after theta, {_count(1, HORIZONS)}", 1, call, scene)
 
     def _risk(self) -> Iterator[Row]:
-        """The first agent drives through the others: it is left out of them."""
-        times = self.horizons(HORIZONS)
-        scene = crowd(self._first, AT_RISK + 1)
-        others = replace(scene, target=scene.target[1:])
-        paths = fan(scene, int(scene.target[0]), np.array(times), TRAJECTORIES)
+        """The first target drives through the others: it is left out of them."""
+        times, own = self.horizons(HORIZONS), int(self._first.target[0])
+        others = np.delete(np.arange(len(self._first.past)), own)[:AT_RISK]
+        scene = self._first if not len(others) else replace(self._first, target=others)
         call = partial(
             self.forecaster.collision_probability,
-            trajectories=paths,
+            trajectories=fan(scene, own, np.array(times), TRAJECTORIES),
             ego_size=EGO_SIZE,
             horizons=times,
-            exclude=(int(scene.target[0]),),
+            exclude=(own,),
         )
         name = f"risk after theta, {TRAJECTORIES} trajectories, {_count(AT_RISK, HORIZONS)}"
-        yield self._row("risk", name, 1, call, others)
+        yield self._row("risk", name, 1, call, crowd(scene, AT_RISK))
 
     def serve(self, count: int, seed: int = 0, every: int | None = None) -> Serving | None:
         """Forecast `count` scenes of changing size, certified; None where memory cannot be read.
@@ -213,13 +212,15 @@ class Bench:
 
 
 def fan(scene: Scene, agent: int, times: npt.NDArray[Any], count: int) -> npt.NDArray[np.float64]:
-    """Arcs [count, T, 3] (x, y, yaw, scene frame) that an agent might drive from now on, at a tenth as many
-    curvatures as there are arcs, and speeds up to one and a half of its own."""
+    """Paths [count, T, 3] (x, y, yaw, scene frame) that an agent might drive from now on: ten curvatures up to 0.1
+    1/m either way, and accelerations from -4 to 4 m/s² until it stands."""
     x, y, sin, cos, speed = scene.past[agent, -1].astype(np.float64)
-    speeds = np.linspace(0.0, 1.5, count // 10) * max(float(speed), 2.0)
-    curvature, v = (m.ravel()[:, None] for m in np.meshgrid(np.linspace(-0.1, 0.1, 10), speeds))
-    turn = curvature * v * times
-    reach = v * times * np.sinc(turn / (2.0 * np.pi))  # the chord
+    rates = np.linspace(-4.0, 4.0, count // 10)
+    curvature, rate = (m.ravel()[:, None] for m in np.meshgrid(np.linspace(-0.1, 0.1, 10), rates))
+    until = np.where(rate < 0.0, np.minimum(times, speed / np.maximum(-rate, 1e-9)), times)
+    way = speed * until + 0.5 * rate * until**2
+    turn = curvature * way
+    reach = way * np.sinc(turn / (2.0 * np.pi))  # the chord of the arc
     yaw = np.arctan2(sin, cos)
     place = [x + reach * np.cos(yaw + turn / 2.0), y + reach * np.sin(yaw + turn / 2.0), yaw + turn]
     return np.stack(np.broadcast_arrays(*place), axis=-1)
