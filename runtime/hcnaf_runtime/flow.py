@@ -18,7 +18,7 @@ from hcnaf_runtime.workers import Workers
 Float32 = npt.NDArray[np.float32]
 T = TypeVar("T")
 
-PART = CHUNK // 4
+PART = 1 << 17
 """Queries are cut into parts of about so many numbers in the widest intermediate."""
 
 DRAWS = 1 << 17
