@@ -5,30 +5,24 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
+from hcnaf_cli import options
+
 if TYPE_CHECKING:
     from hcnaf_runtime import Bundle, Scene
     from hcnaf_runtime.occupancy import Occupancy
-
-_FILE = click.Path(path_type=Path)
 
 LEVELS = (0.01, 0.1, 0.5)
 """Probabilities for which the covered area is said."""
 
 
 @click.command()
-@click.argument("scene", type=_FILE, required=False)
-@click.option(
-    "--sample",
-    is_flag=False,
-    flag_value="*",
-    metavar="[NAME]",
-    help="A scene that comes with the package: the first, or the one of that name.",
-)
-@click.option("--model", type=_FILE, metavar="BUNDLE", help="Bundle directory [default: the embedded one].")
-@click.option("-o", "--out", type=_FILE, metavar="OUT.npz", help="Write the occupancy.")
-@click.option("--plot", type=_FILE, metavar="OUT.png", help="Draw it over the scene (extra `plot`).")
+@options.scene
+@options.sample
+@options.model
+@click.option("-o", "--out", type=options.FILE, metavar="OUT.npz", help="Write the occupancy.")
+@click.option("--plot", type=options.FILE, metavar="OUT.png", help="Draw it over the scene (extra `plot`).")
 @click.option("--grid", metavar="COLSxROWS@M", help="Cells [default: 200x200@0.5].")
-@click.option("--horizons", metavar="1,2,4", help="Seconds ahead [default: every whole second].")
+@options.horizons
 @click.option(
     "--heading",
     type=click.Choice(["motion", "present"]),
@@ -36,9 +30,9 @@ LEVELS = (0.01, 0.1, 0.5)
     show_default=True,
     help="Boxes turn as their way implies, or stay as they are.",
 )
-@click.option("--exclude", metavar="0,3", help="Agents to leave out, such as the own vehicle.")
-@click.option("--threads", type=click.IntRange(min=1), help="CPU threads [default: at most 4].")
-@click.option("--json", "as_json", is_flag=True, help="Print JSON instead of text.")
+@options.exclude
+@options.threads
+@options.as_json
 def occupancy(
     scene: Path | None,
     sample: str | None,

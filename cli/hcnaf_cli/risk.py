@@ -5,11 +5,11 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
+from hcnaf_cli import options
+
 if TYPE_CHECKING:
     from hcnaf_runtime import Bundle, Scene
     from hcnaf_runtime.risk import Risk
-
-_FILE = click.Path(path_type=Path)
 
 MOST_ROWS = 30
 """Trajectories listed one by one."""
@@ -22,17 +22,11 @@ ITSELF = 0.5
 
 
 @click.command()
-@click.argument("scene", type=_FILE, required=False)
-@click.option(
-    "--sample",
-    is_flag=False,
-    flag_value="*",
-    metavar="[NAME]",
-    help="A scene that comes with the package: the first, or the one of that name.",
-)
+@options.scene
+@options.sample
 @click.option(
     "--trajectory",
-    type=_FILE,
+    type=options.FILE,
     required=True,
     metavar="FILE",
     help="t, x, y, yaw (s, m, rad; scene frame): lines of .csv, or [T, 4] or [K, T, 4] in .npy, .npz or .json.",
@@ -47,13 +41,13 @@ ITSELF = 0.5
     show_default=True,
     help="Other boxes turn as their way implies, or stay as they are.",
 )
-@click.option("--exclude", metavar="0,3", help="Agents to leave out, such as the own vehicle.")
+@options.exclude
 @click.option("--draws", type=click.IntRange(0, 100_000), default=0, help="Estimate from so many coupled samples.")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of the samples.")
-@click.option("--model", type=_FILE, metavar="BUNDLE", help="Bundle directory [default: the embedded one].")
-@click.option("--plot", type=_FILE, metavar="OUT.png", help="Draw the risk over the scene (extra `plot`).")
-@click.option("--threads", type=click.IntRange(min=1), help="CPU threads [default: at most 4].")
-@click.option("--json", "as_json", is_flag=True, help="Print JSON instead of text.")
+@options.model
+@click.option("--plot", type=options.FILE, metavar="OUT.png", help="Draw the risk over the scene (extra `plot`).")
+@options.threads
+@options.as_json
 def risk(
     scene: Path | None,
     sample: str | None,

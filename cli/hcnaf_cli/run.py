@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 import click
 
+from hcnaf_cli import options
 from hcnaf_cli.bench import bench
 from hcnaf_cli.errors import Commands
 from hcnaf_cli.occupancy import occupancy
@@ -18,24 +19,7 @@ from hcnaf_runtime._version import __version__
 if TYPE_CHECKING:
     from hcnaf_runtime import Maps, Scene
 
-_FILE = click.Path(path_type=Path)
-
-_scene = click.argument("scene", type=_FILE, required=False)
-_sample = click.option(
-    "--sample",
-    is_flag=False,
-    flag_value="*",
-    metavar="[NAME]",
-    help="A scene that comes with the package: the first, or the one of that name.",
-)
-_model = click.option(
-    "--model", type=_FILE, metavar="BUNDLE", help="Bundle directory [default: the embedded one]."
-)
-_bundle = click.argument("bundle", type=_FILE, required=False)
-_horizons = click.option("--horizons", metavar="1,2,4", help="Seconds ahead [default: every whole second].")
-_frame = click.option("--frame", type=click.Choice(["agent", "scene"]), default="agent", show_default=True)
-_threads = click.option("--threads", type=click.IntRange(min=1), help="CPU threads [default: at most 4].")
-_json = click.option("--json", "as_json", is_flag=True, help="Print JSON instead of text.")
+_bundle = click.argument("bundle", type=options.FILE, required=False)
 
 
 @click.group(cls=Commands, name="hcnaf-run", context_settings={"help_option_names": ["-h", "--help"]})
@@ -45,11 +29,11 @@ def main() -> None:
 
 
 @main.command()
-@_scene
-@_sample
-@_model
-@click.option("-o", "--out", type=_FILE, metavar="FORECAST.npz", help="Write the maps.")
-@click.option("--plot", type=_FILE, metavar="OUT.png", help="Draw the maps over the scene (extra `plot`).")
+@options.scene
+@options.sample
+@options.model
+@click.option("-o", "--out", type=options.FILE, metavar="FORECAST.npz", help="Write the maps.")
+@click.option("--plot", type=options.FILE, metavar="OUT.png", help="Draw the maps over the scene (extra `plot`).")
 @click.option("--grid", metavar="COLSxROWS@M", help="Cells of each map [default: 200x200@0.5].")
 @click.option(
     "--lost-mass",
@@ -58,10 +42,10 @@ def main() -> None:
     show_default=True,
     help="Leave cells empty while they hold less together.",
 )
-@_horizons
-@_frame
-@_threads
-@_json
+@options.horizons
+@options.frame
+@options.threads
+@options.as_json
 def forecast(
     scene: Path | None,
     sample: str | None,
@@ -121,14 +105,16 @@ def _write(out: Path | None, plot: Path | None, name: str, scene: "Scene", maps:
 
 
 @main.command()
-@_scene
-@_sample
-@click.option("--points", type=_FILE, required=True, metavar="FILE", help="x,y in metres: .npy, or lines of text.")
-@_model
-@_horizons
-@_frame
-@_threads
-@_json
+@options.scene
+@options.sample
+@click.option(
+    "--points", type=options.FILE, required=True, metavar="FILE", help="x,y in metres: .npy, or lines of text."
+)
+@options.model
+@options.horizons
+@options.frame
+@options.threads
+@options.as_json
 def logprob(
     scene: Path | None,
     sample: str | None,
@@ -161,7 +147,7 @@ def logprob(
 
 @main.command()
 @_bundle
-@_json
+@options.as_json
 def info(bundle: Path | None, as_json: bool) -> None:
     """What BUNDLE (default: the embedded model) is, needs and scores."""
     from hcnaf_cli import report
@@ -177,8 +163,8 @@ def info(bundle: Path | None, as_json: bool) -> None:
 
 @main.command()
 @_bundle
-@_threads
-@_json
+@options.threads
+@options.as_json
 def verify(bundle: Path | None, threads: int | None, as_json: bool) -> None:
     """Check that BUNDLE (default: the embedded model) computes here what it computed where it was made."""
     from hcnaf_cli import report

@@ -5,35 +5,31 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
+from hcnaf_cli import options
+
 if TYPE_CHECKING:
     from hcnaf_runtime import Bundle
     from hcnaf_runtime.samples import Samples
-
-_FILE = click.Path(path_type=Path)
 
 MOST_PRINTED = 1_000_000
 """Points printed as JSON; more are for a file."""
 
 
 @click.command()
-@click.argument("scene", type=_FILE, required=False)
-@click.option(
-    "--sample",
-    is_flag=False,
-    flag_value="*",
-    metavar="[NAME]",
-    help="A scene that comes with the package: the first, or the one of that name.",
-)
-@click.option("--model", type=_FILE, metavar="BUNDLE", help="Bundle directory [default: the embedded one].")
+@options.scene
+@options.sample
+@options.model
 @click.option("-n", "count", type=click.IntRange(min=1), default=100, show_default=True, help="Samples per agent.")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
 @click.option("--trajectories", is_flag=True, help="Couple the horizons by their quantiles: samples are paths.")
-@click.option("-o", "--out", type=_FILE, metavar="OUT.npz", help="Write the samples.")
-@click.option("--plot", type=_FILE, metavar="OUT.png", help="Draw the samples over the scene (extra `plot`).")
-@click.option("--horizons", metavar="1,2,4", help="Seconds ahead [default: every whole second].")
-@click.option("--frame", type=click.Choice(["agent", "scene"]), default="agent", show_default=True)
-@click.option("--threads", type=click.IntRange(min=1), help="CPU threads [default: at most 4].")
-@click.option("--json", "as_json", is_flag=True, help="Print JSON instead of text.")
+@click.option("-o", "--out", type=options.FILE, metavar="OUT.npz", help="Write the samples.")
+@click.option(
+    "--plot", type=options.FILE, metavar="OUT.png", help="Draw the samples over the scene (extra `plot`)."
+)
+@options.horizons
+@options.frame
+@options.threads
+@options.as_json
 def sample(
     scene: Path | None,
     sample: str | None,
