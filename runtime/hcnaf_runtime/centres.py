@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from hcnaf_runtime.trapezoids import Distribution
+from hcnaf_runtime.plane import Distribution
 
 Float32 = npt.NDArray[np.float32]
 Float64 = npt.NDArray[np.float64]

@@ -24,8 +24,8 @@ from hcnaf_runtime.footprint import motion_changes, motion_headings, raster, spr
 from hcnaf_runtime.grid import Grid
 from hcnaf_runtime.maps import Timings
 from hcnaf_runtime.npz import write_npz
+from hcnaf_runtime.plane import Distribution
 from hcnaf_runtime.scene import Scene
-from hcnaf_runtime.trapezoids import Distribution
 
 Float32 = npt.NDArray[np.float32]
 Float64 = npt.NDArray[np.float64]

@@ -29,6 +29,9 @@ class Distribution(Protocol):
         """Mass [B, E - 1, C], the sum over s of weight [B, S, C] times F_2's increments along y [B, E] given x
         [B, S]; and [B, C], the largest |sum| with the weights `doubt`, or what was below 0."""
 
+    def conditional_cdf(self, theta: Float32, x: Float32, y: Float32) -> Float32:
+        """F_2 [B, S, E] at `y` [B, S, E] given `x` [B, S] (m)."""
+
     def grid_cdf(self, theta: Float32, x: Float32, y: Float32) -> Float32:
         """F_2 [B, E, S] at every pair of `x` [B, S] and `y` [B, E] (m)."""
 

@@ -53,14 +53,9 @@ class Rule:
         return (F[..., self._panel] @ self._derivative).reshape(*F.shape[:-1], self.size)
 
     @cached_property
-    def spread(self) -> Float64:
-        """[S, S]: what each node of the weights takes from the values of g at the nodes: itself alone."""
-        return np.eye(self.size)
-
-    @cached_property
     def doubt(self) -> Float64:
-        """[S, S]: `spread` minus the polynomial through all nodes of a panel but the second from either end, to
-        judge the error by."""
+        """[S, S]: values at the nodes minus those of the polynomial through all nodes of a panel but the second
+        from either end, to judge the error by."""
         t = _gauss(self.order)[0]
         fewer = np.delete(np.arange(self.order), [1, self.order - 2])
         lesser = np.zeros((self.order, self.order))

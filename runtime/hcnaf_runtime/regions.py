@@ -14,9 +14,10 @@ import numpy.typing as npt
 from hcnaf_runtime.encoder import Theta
 from hcnaf_runtime.errors import InputError
 from hcnaf_runtime.frames import to_agent
+from hcnaf_runtime.plane import CHUNK, Distribution
 from hcnaf_runtime.sketch import Sketch, ranges, sketch
 from hcnaf_runtime.slabs import slabs
-from hcnaf_runtime.trapezoids import CHUNK, Distribution, Trapezoids, masses, with_ends
+from hcnaf_runtime.trapezoids import Trapezoids, masses, with_ends
 
 Float32 = npt.NDArray[np.float32]
 Float64 = npt.NDArray[np.float64]

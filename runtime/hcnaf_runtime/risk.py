@@ -28,10 +28,10 @@ from hcnaf_runtime.encoder import Theta
 from hcnaf_runtime.errors import InputError
 from hcnaf_runtime.footprint import motion_headings
 from hcnaf_runtime.maps import Timings
+from hcnaf_runtime.plane import Distribution
 from hcnaf_runtime.regions import check_tolerance, probability
 from hcnaf_runtime.scene import Scene
 from hcnaf_runtime.sketch import bracket
-from hcnaf_runtime.trapezoids import Distribution
 
 Float32 = npt.NDArray[np.float32]
 Float64 = npt.NDArray[np.float64]

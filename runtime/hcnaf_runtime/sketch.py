@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from hcnaf_runtime.trapezoids import CHUNK, Distribution, Trapezoids
+from hcnaf_runtime.plane import CHUNK, Distribution
+from hcnaf_runtime.trapezoids import Trapezoids
 
 Float32 = npt.NDArray[np.float32]
 Float64 = npt.NDArray[np.float64]

@@ -8,13 +8,14 @@ exact in y, a quadrature in x from values of F_1 alone (`rules`). Where two trie
 is cut in two. Nodes of all trapezoids of a map are run together: a graph takes longest to read theta.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
+from hcnaf_runtime.plane import CHUNK, Distribution
 from hcnaf_runtime.rules import ADDED, GAUSS, KRONROD, SHARED, first_try, second_try
 
 Float32 = npt.NDArray[np.float32]
@@ -29,9 +30,6 @@ DEPTH = 12
 WIDTH = 128
 """Most trapezoids in a row of a run."""
 
-CHUNK = 1 << 18
-"""Numbers in the widest intermediate of a run, nodes x 2 x hidden units."""
-
 SAME = 1e-7
 """Sides no further apart (m) are one."""
 
@@ -41,23 +39,6 @@ GUESS = 0.2
 
 NOISE = 4.0
 """How much larger the doubt is than the roundings that it stems from."""
-
-
-class Distribution(Protocol):
-    """The two-dimensional flow as the graphs of a bundle give it, for theta [B, P] of B maps."""
-
-    @property
-    def hidden(self) -> int:
-        """H, hidden units per dimension."""
-
-    def marginal_cdf(self, theta: Float32, x: Float32) -> Float32:
-        """F_1 [B, K] at `x` [B, K] (m)."""
-
-    def conditional_cdf(self, theta: Float32, x: Float32, y: Float32) -> Float32:
-        """F_2 [B, S, E] at `y` [B, S, E] given `x` [B, S] (m)."""
-
-    def each(self, work: Callable[[T], object], items: Iterable[T]) -> None:
-        """Call `work` with each item, on as many threads as there are."""
 
 
 @dataclass(frozen=True, eq=False)
