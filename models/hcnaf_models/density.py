@@ -77,17 +77,25 @@ def _first(stack: list[PlanarLayer], u: Tensor) -> tuple[tuple[Tensor, Tensor, T
 def _second(stack: list[PlanarLayer], v: Tensor, contexts: list[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
     """z_2, log dz_2/dy [B, 1, N] and limits [B, 2, N]."""
     h, t, log_scale = _activate(stack[0].W_22 * v + contexts[0], stack[0].W_22)
-    up = torch.ones_like(h)
-    down = -up
+    ends: tuple[Tensor, ...] = ()  # the units at y = +-infinity, once they depend on x
     for layer, c in zip(stack[1:-1], contexts[1:-1], strict=True):
-        a, rise, fall, du = _product(layer.W_22, h, up, down, t)
-        up, down = torch.tanh(rise + c), torch.tanh(fall + c)
+        a, du, rise, fall = _pushed(layer.W_22, h, t, ends)
+        ends = torch.tanh(rise + c), torch.tanh(fall + c)
         h, t, scale = _activate(a + c, du)
         log_scale = log_scale + scale
-    a, rise, fall, du = _product(stack[-1].W_22, h, up, down, t)
+    a, du, rise, fall = _pushed(stack[-1].W_22, h, t, ends)
     c = contexts[-1]
-    ends = torch.cat([rise + c, fall + c], dim=1)
-    return a + c, torch.log(torch.clamp(du, min=TINY)) + log_scale, ends
+    limits = torch.cat([rise + c, fall + c], dim=1)
+    return a + c, torch.log(torch.clamp(du, min=TINY)) + log_scale, limits
+
+
+def _pushed(W: Tensor, h: Tensor, t: Tensor, ends: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+    """W [B, H_out, H] times h, t and either end; where there are none yet these are +1 and -1 for all points."""
+    if ends:
+        return _product(W, h, t, *ends)
+    a, du = _product(W, h, t)
+    total = W.sum(-1, keepdim=True)
+    return a, du, total, -total
 
 
 def _product(W: Tensor, *parts: Tensor) -> tuple[Tensor, ...]:

@@ -138,9 +138,11 @@ class Bench:
         times = self.horizons(HORIZONS)
         call = partial(self.forecaster.pom, grid=self.grid, horizons=times, lost_mass=LOST_MASS)
         for name, scene in self.scenes.items():
-            single = crowd(scene, 1)
-            row = self._row("certified", f"certified maps after theta, {name}", HORIZONS, call, single)
-            yield replace(row, facts={"lost_mass": float(np.max(call(single).lost_mass))})
+            for agents in dict.fromkeys((1, len(scene.target))):
+                some, maps = crowd(scene, agents), agents * HORIZONS
+                title = f"certified maps after theta, {name}, {_count(agents, HORIZONS)}"
+                row = self._row("certified", title, maps, call, some)
+                yield replace(row, facts={"lost_mass": float(np.max(call(some).lost_mass))})
 
     def _forecast(self) -> Iterator[Row]:
         times = self.horizons(HORIZONS)

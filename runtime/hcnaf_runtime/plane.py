@@ -9,8 +9,8 @@ import numpy.typing as npt
 
 Float32 = npt.NDArray[np.float32]
 
-CHUNK = 1 << 18
-"""Numbers in the widest intermediate of a graph run, nodes x edges x hidden units: 1 MiB."""
+CHUNK = 1 << 19
+"""Numbers in the widest intermediate of a graph run, nodes x edges x hidden units: 2 MiB."""
 
 
 class Distribution(Protocol):

@@ -2,7 +2,9 @@
 
 import os
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -83,7 +85,25 @@ def _options(onnxruntime: Any, settings: Settings) -> Any:
     options.add_session_config_entry("session.intra_op.allow_spinning", str(int(settings.spinning)))
     if settings.flush_denormals:
         options.add_session_config_entry("session.set_denormal_as_zero", "1")
+    _share_arena(onnxruntime)
+    options.add_session_config_entry("session.use_env_allocators", "1")
     return options
+
+
+@cache
+def _share_arena(onnxruntime: Any) -> None:
+    """One arena for all graphs of the process, where each would keep what its largest run took.
+
+    Only sessions that ask for it use it. If the program has shared an arena of its own, that one serves.
+    """
+    where = onnxruntime.OrtMemoryInfo(
+        "Cpu", onnxruntime.OrtAllocatorType.ORT_ARENA_ALLOCATOR, 0, onnxruntime.OrtMemType.DEFAULT
+    )
+    # No limit, regions twice as large each time, and the rest as onnxruntime has it.
+    how = {"max_mem": 0, "arena_extend_strategy": 0}
+    how |= {"initial_chunk_size_bytes": -1, "max_dead_bytes_per_chunk": -1}
+    with suppress(Exception):  # there is one already; onnxruntime's exceptions share no base but Exception
+        onnxruntime.create_and_register_allocator(where, onnxruntime.OrtArenaCfg(how))
 
 
 def _check_version(installed: str, smallest: str, path: Path) -> None:

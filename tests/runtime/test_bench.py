@@ -113,8 +113,10 @@ def test_maps_after_theta_do_not_run_the_hypernet(bench, monkeypatch):
 
 
 def test_certified_rows_state_what_was_lost(bench):
-    (row,) = bench.rows(["certified"])
-    assert 0 <= row.facts["lost_mass"] <= LOST_MASS
+    alone, together = bench.rows(["certified"])
+    assert (alone.maps, together.maps) == (HORIZONS, len(bench.scenes["crossing"].target) * HORIZONS)
+    for row in (alone, together):
+        assert 0 <= row.facts["lost_mass"] <= LOST_MASS
 
 
 def test_horizons_span_the_trained_range(bench):
