@@ -22,7 +22,7 @@ from hcnaf_runtime.plane import CHUNK, Distribution, Window
 Float32 = npt.NDArray[np.float32]
 Float64 = npt.NDArray[np.float64]
 
-SHARE, SHARES = 64, 8
+SHARE, SHARES = 128, 8
 """Maps are shared out to threads by so many, in two shares at least and in this many at most."""
 
 

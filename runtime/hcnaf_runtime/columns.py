@@ -29,7 +29,7 @@ HOPELESS = 8
 WIDTH = 44
 """Most columns in a tile, and most nodes in one where each column has several."""
 
-BATCH = 4096
+BATCH = 8192
 """Most nodes in the tiles that are looked at together."""
 
 NEGLIGIBLE = 1e-9

@@ -34,7 +34,7 @@ TRY = 10.0
 LANES = 16
 """Numbers of nodes are alike if they fill as many vectors of this length: a product takes as long for all."""
 
-WASTE = 1 << 16
+WASTE = 1 << 17
 """Most of them that are padding: computing so many takes about as long as starting another run."""
 
 
