@@ -5,16 +5,18 @@ from __future__ import annotations
 import pickle
 import zipfile
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from hcnaf_export.baselines import build
 from hcnaf_export.training.state import replace
-from hcnaf_models.config import ModelConfig, from_dict, to_dict
-from hcnaf_models.model import Hcnaf, build
+from hcnaf_models.config import ModelConfig, from_dict
+from hcnaf_models.model import Hcnaf
+from hcnaf_models.wide_config import WideConfig
 from hcnaf_runtime.errors import CheckpointError
 
 FORMAT = 1
@@ -40,7 +42,7 @@ class Checkpoint:
 
 def save_checkpoint(
     path: Path,
-    config: ModelConfig,
+    config: ModelConfig | WideConfig,
     state: Mapping[str, Tensor],
     training: dict[str, Any],
     scores: dict[str, Any],
@@ -49,7 +51,7 @@ def save_checkpoint(
     content = {
         "producer": "hcnaf",
         "format": FORMAT,
-        "config": to_dict(config),
+        "config": asdict(config),
         "state": {name: value.detach().cpu().contiguous() for name, value in state.items()},
         "training": training,
         "scores": scores,
@@ -64,13 +66,7 @@ def load_checkpoint(path: Path) -> Checkpoint:
         CheckpointError: missing, not a torch file, holding code, not ours, of a future format, or with weights
             that do not fit its configuration.
     """
-    content = _read(Path(path))
-    if not isinstance(content, dict) or content.get("producer") != "hcnaf" or "config" not in content:
-        raise CheckpointError(f"{path} is not a checkpoint of hcnaf train; expected the model.pt of a run")
-    if content.get("format") != FORMAT:
-        raise CheckpointError(
-            f"{path} has checkpoint format {content.get('format')!r}, this release reads {FORMAT}; update hcnaf"
-        )
+    content = read_content(Path(path))
     try:
         config = from_dict(content["config"])
         model = _build(config)
@@ -80,6 +76,19 @@ def load_checkpoint(path: Path) -> Checkpoint:
         raise CheckpointError(f"{path}: weights do not fit the configuration ({reason}); train again") from error
     model.eval().requires_grad_(False)
     return Checkpoint(config, model, dict(content.get("training", {})), dict(content.get("scores", {})))
+
+
+def read_content(path: Path) -> dict[str, Any]:
+    """What `save_checkpoint` wrote, of whatever kind. Raises CheckpointError if that is not what the file is."""
+    content: dict[str, Any] = _read(path)
+    ours = isinstance(content, dict) and content.get("producer") == "hcnaf"
+    if not ours or not isinstance(content.get("config"), dict):
+        raise CheckpointError(f"{path} is not a checkpoint of hcnaf train; expected the model.pt of a run")
+    if content.get("format") != FORMAT:
+        raise CheckpointError(
+            f"{path} has checkpoint format {content.get('format')!r}, this release reads {FORMAT}; update hcnaf"
+        )
+    return content
 
 
 def _read(path: Path) -> Any:

@@ -51,7 +51,7 @@ def metadata(
             "optional_channels": ",".join(optional),
             "stops": int(config.stops),
         }
-    else:
+    elif isinstance(config, ConditionConfig):
         facts |= {"condition_size": config.size, "condition_names": ",".join(condition_names(config))}
     return {f"hcnaf.{key}": str(value) for key, value in facts.items()}
 
@@ -74,7 +74,7 @@ def manifest(
         name=name,
         version=__version__,
         created=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-        kind=config.kind,
+        kind="pom" if isinstance(config, PomConfig) else "condition",
         flow=m.Flow(
             dims=flow.dims,
             layers=flow.layers,
@@ -101,6 +101,7 @@ def _input(config: ModelConfig, optional: Sequence[str]) -> dict[str, Any]:
     """The part of the manifest that says what the hyper-network needs."""
     if isinstance(config, ConditionConfig):
         return {"condition": m.ConditionContract(size=config.size, names=list(condition_names(config)))}
+    assert isinstance(config, PomConfig)  # see `exportable`
     scene = m.SceneContract(
         step=config.step,
         history=config.history,
@@ -118,7 +119,7 @@ def condition_names(config: ConditionConfig) -> tuple[str, ...]:
 
 def optional_channels(config: ModelConfig, training: Mapping[str, Any]) -> tuple[str, ...]:
     """Raster channels that training dropped at random and that may therefore be absent, in the graph's order."""
-    if isinstance(config, ConditionConfig):
+    if not isinstance(config, PomConfig):
         return ()
     dropped = training.get("optional_channels") or ()
     return tuple(c for c in config.channels if c in dropped)

@@ -14,7 +14,7 @@ from hcnaf_export.graphs import Graph
 from hcnaf_export.parity import open_graph, run_torch
 from hcnaf_export.probes import SEED, Feeds, SceneSetting, conditions, edges, flow_feeds, scene
 from hcnaf_export.tolerances import GOLDEN_FACTOR, GOLDEN_INT8, tolerance
-from hcnaf_models.config import ConditionConfig
+from hcnaf_models.config import ConditionConfig, PomConfig
 from hcnaf_models.model import Hcnaf
 from hcnaf_runtime.manifest import Precision
 
@@ -49,6 +49,7 @@ def _hypernet_feeds(model: Hcnaf) -> Feeds:
     rng = np.random.default_rng(SEED)
     if isinstance(model.config, ConditionConfig):
         return conditions(model.config, rng)["typical"]
+    assert isinstance(model.config, PomConfig)  # see `exportable`
     return scene(model.config, SETTING, rng)
 
 

@@ -16,9 +16,8 @@ import torch
 from torch import Tensor, nn
 
 from hcnaf_models import density, flow, normal, planar, sampling
-from hcnaf_models.config import PomConfig
+from hcnaf_models.config import ConditionConfig, PomConfig
 from hcnaf_models.geometry import pose_of
-from hcnaf_models.mlp import ConditionHyperNet
 from hcnaf_models.model import Hcnaf
 from hcnaf_models.pom import PomHyperNet
 from hcnaf_models.raster import crop_raster
@@ -112,20 +111,20 @@ class CellMassGraph(nn.Module):
 
 
 class InverseGraph(nn.Module):
-    """theta [B, P], uniform [B, M, 2] -> points [B, M, 2], log_prob [B, M]."""
+    """theta [B, P], uniform [B, M, 2] -> points [B, M, 2], log_prob [B, M], error [B, M]."""
 
     def __init__(self, spec: FlowSpec) -> None:
         super().__init__()
         self.spec = spec
 
-    def forward(self, theta: Tensor, uniform: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(self, theta: Tensor, uniform: Tensor) -> sampling.Drawn:
         return sampling.planar_inverse(self.spec, theta, uniform)
 
 
 class ConditionGraph(nn.Module):
     """condition [A, K] -> theta [A, 1, P]."""
 
-    def __init__(self, hypernet: ConditionHyperNet) -> None:
+    def __init__(self, hypernet: nn.Module) -> None:
         super().__init__()
         self.hypernet = hypernet
 
@@ -222,7 +221,8 @@ def _hypernet(model: Hcnaf) -> Graph:
     hypernet = model.hypernet
     if isinstance(hypernet, PomHyperNet):
         return _scene(hypernet)
-    config = hypernet.config
+    config = model.config
+    assert isinstance(config, ConditionConfig)
     condition = _tensor("condition", f"A {config.size}", "", "one condition per row")
     return Graph("hypernet", ConditionGraph(hypernet), (condition,), (_theta(config.flow, "A 1"),))
 
@@ -292,5 +292,6 @@ def _inverse(spec: FlowSpec) -> Graph:
     outputs = (
         _tensor("points", "B M 2", "m", "the points with these values, in the frame of theta"),
         _tensor("log_prob", "B M", "nat per m^2", "log p at the points"),
+        _tensor("error", "B M", "", "how far F_1 or F_2 at the points is from uniform; if far, draw these alone"),
     )
     return Graph("inverse", InverseGraph(spec), (_theta(spec), uniform), outputs)

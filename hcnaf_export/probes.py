@@ -85,6 +85,9 @@ def _surroundings(config: PomConfig, setting: SceneSetting, rng: np.random.Gener
         rows, columns = setting.raster
         patches = rng.integers(-127, 128, (len(config.channels), -(-rows // 8), -(-columns // 8)))
         blocks = patches.repeat(8, axis=1).repeat(8, axis=2)[:, :rows, :columns]
+        scans = [k for k, name in enumerate(config.channels) if name.startswith("lidar_")]
+        if scans:  # as sparse as scans are, and never negative
+            blocks[scans] = 127 * (rng.random((len(scans), rows, columns)) < 0.04)
         feeds["raster"] = blocks.astype(np.int8)
         corner = setting.centre - 0.25 * np.array([columns, rows])
         feeds["raster_origin"] = corner.astype(np.float32)
@@ -134,6 +137,7 @@ def hypernet_feeds(model: Hcnaf) -> dict[str, Feeds]:
     rng = np.random.default_rng(SEED)
     if isinstance(model.config, ConditionConfig):
         return conditions(model.config, rng)
+    assert isinstance(model.config, PomConfig)  # see `exportable`
     return {name: scene(model.config, setting, rng) for name, setting in SCENES.items()}
 
 

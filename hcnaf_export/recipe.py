@@ -1,6 +1,6 @@
 """Training recipes: TOML files, read strictly into frozen data.
 
-    recipe.toml ── read_recipe ──> PomRecipe | ToyRecipe ── run_training ──> run directory
+    recipe.toml ── read_recipe ──> PomRecipe | ToyRecipe | ... ── run_training ──> run directory
 
 Shipped recipes are found by name (`shipped()` lists them), others by path. Every key is checked: an unknown
 one is refused, naming it and what is known, since a misspelt setting that is ignored costs hours.
@@ -16,8 +16,9 @@ from typing import Any, Literal
 
 import msgspec
 
-from hcnaf_models.config import MAP_CHANNELS, ConditionConfig, Crop, PomConfig
+from hcnaf_models.config import MAP_CHANNELS, ConditionConfig, Crop, HistoryConfig, PomConfig
 from hcnaf_models.spec import FlowSpec
+from hcnaf_models.wide_config import WideConfig
 from hcnaf_runtime.errors import RecipeError
 
 _NESTED: dict[str, type[Any]] = {"flow": FlowSpec, "crop": Crop}
@@ -40,6 +41,8 @@ class Optimiser(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
         average: decay of the exponential average of the weights that is scored and exported.
         validate_every: steps between validations.
         patience: bad steps (loss or gradient not finite) in a row that end the run.
+        precision: float32, or on CUDA devices bfloat16 or float16 for the networks that read the scene; the flow
+            is in float32 always.
     """
 
     steps: int
@@ -55,6 +58,7 @@ class Optimiser(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     average: float = 0.999
     validate_every: int = 500
     patience: int = 20
+    precision: Literal["float32", "bfloat16", "float16"] = "float32"
 
     def __post_init__(self) -> None:
         whole = {"steps": self.steps, "batch": self.batch, "validate_every": self.validate_every}
@@ -104,6 +108,57 @@ class Samples(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     validation: int = 20_000
 
 
+class PedestrianTracks(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """How training windows are made from ETH/UCY recordings.
+
+    Attributes:
+        split: the split that is held out for tests: eth, hotel, univ, zara1 or zara2.
+        validation: whole recordings that choose the best weights; those that are tested on are left out.
+        horizons: horizons drawn per window, of twelve.
+        noise: standard deviation of what is added to labels (m), in training and validation. Annotations repeat
+            and interpolate positions: without it the likelihood of labels has no upper bound.
+        stretch: tracks grow by a random factor within exp(+-stretch).
+        roughness: half of the tracks get noise at all their positions, whose standard deviation lies between 3 mm
+            and this (m): recordings differ in how smooth their annotations are.
+        compile: train through torch.compile where there is a C++ compiler: the same function, faster.
+    """
+
+    split: str = "zara1"
+    validation: tuple[str, ...] = ("crowds_zara03", "uni_examples")
+    horizons: int = 4
+    noise: float = 0.01
+    stretch: float = 0.2
+    roughness: float = 0.0
+    compile: bool = False
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.horizons <= 12 or min(self.noise, self.stretch) < 0.0 or 0.0 != self.roughness < 0.003:
+            raise ValueError(
+                f"horizons must be 1 to 12 (found {self.horizons}), noise and stretch 0 or more (found "
+                f"{self.noise}, {self.stretch}), roughness 0 or at least 0.003 (found {self.roughness})"
+            )
+
+
+class Episodes(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """How training batches are made from PRECOG-CARLA episodes.
+
+    Attributes:
+        noise: standard deviation of what is added to labels (m), in training and validation. 0.5 m is what the
+            published code adds, 0.01 of metres / 50; PRECOG adds 0.01 m.
+        draws: draws of it per horizon.
+        horizons: future rows drawn per episode, of those within the model's horizon.
+        thin: in training every episode loses a share of its overhead pixels, drawn evenly from 0 to this: scans of
+            one place differ more than a small set of episodes shows.
+        validation: episodes of the validation split that are scored (0: all).
+    """
+
+    noise: float = 0.5
+    draws: int = 10
+    horizons: int = 8
+    thin: float = 0.0
+    validation: int = 2000
+
+
 class PomRecipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Occupancy forecasts from tracks and maps."""
 
@@ -113,6 +168,18 @@ class PomRecipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     optimiser: Optimiser
     model: PomConfig = PomConfig()
     windows: Windows = Windows()
+    seed: int = 0
+
+
+class PrecogRecipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Forecasts of the player of PRECOG-CARLA episodes. `model.step` is the time between the files' rows (s)."""
+
+    name: str
+    about: str
+    task: Literal["precog"]
+    optimiser: Optimiser
+    model: PomConfig = PomConfig()
+    episodes: Episodes = Episodes()
     seed: int = 0
 
 
@@ -128,9 +195,57 @@ class ToyRecipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     seed: int = 0
 
 
-Recipe = PomRecipe | ToyRecipe
+class TrackRecipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Forecasts from a pedestrian's track alone."""
 
-_TASKS: dict[str, type[Any]] = {"pom": PomRecipe, "toy1": ToyRecipe, "toy2": ToyRecipe}
+    name: str
+    about: str
+    task: Literal["eth-ucy"]
+    optimiser: Optimiser
+    model: HistoryConfig = HistoryConfig()
+    tracks: PedestrianTracks = PedestrianTracks()
+    seed: int = 0
+
+
+class MnistRecipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The density of MNIST's images under their class.
+
+    Attributes:
+        units: training images that location, scale and quantiles are taken from, to start with.
+        validation: validation images that are scored.
+        drop: share of what a pixel hears from earlier ones that is left out at random in training.
+    """
+
+    name: str
+    about: str
+    task: Literal["mnist"]
+    optimiser: Optimiser
+    model: WideConfig = WideConfig()
+    units: int = 10_000
+    validation: int = 10_000
+    drop: float = 0.0
+    seed: int = 0
+
+
+PlanarRecipe = PomRecipe | PrecogRecipe | ToyRecipe | TrackRecipe
+Recipe = PlanarRecipe | MnistRecipe
+
+_TASKS: dict[str, type[Any]] = {
+    "pom": PomRecipe,
+    "precog": PrecogRecipe,
+    "toy1": ToyRecipe,
+    "toy2": ToyRecipe,
+    "eth-ucy": TrackRecipe,
+    "mnist": MnistRecipe,
+}
+
+_MODELS: dict[type[Any], type[Any]] = {
+    PomRecipe: PomConfig,
+    PrecogRecipe: PomConfig,
+    ToyRecipe: ConditionConfig,
+    TrackRecipe: HistoryConfig,
+    MnistRecipe: WideConfig,
+}
 
 
 def shipped() -> tuple[str, ...]:
@@ -221,8 +336,9 @@ def _refuse_unknown(data: dict[str, Any], kind: type[Any], source: str, path: st
 def _fields(kind: type[Any]) -> dict[str, Any]:
     """Field names, each with the class of its table or None."""
     tables: dict[str, Any] = dict(_NESTED)
-    tables |= {"optimiser": Optimiser, "windows": Windows, "samples": Samples}
-    tables["model"] = PomConfig if kind is PomRecipe else ConditionConfig
+    tables |= {"optimiser": Optimiser, "windows": Windows, "samples": Samples, "tracks": PedestrianTracks}
+    tables["episodes"] = Episodes
+    tables["model"] = _MODELS.get(kind)
     if issubclass(kind, msgspec.Struct):
         names: tuple[str, ...] = kind.__struct_fields__
     else:

@@ -52,6 +52,7 @@ TOLERANCES: dict[tuple[str, str], Tolerance] = {
     ("cell_mass", "cdf"): Tolerance(2e-6, 1.0, _PROBABILITY),
     ("inverse", "points"): Tolerance(1e-3, 1.0, "z's error over dz/dx, which is small where hardly anything is"),
     ("inverse", "log_prob"): Tolerance(1e-3, 50.0, "nats; the density at a point that is as far off"),
+    ("inverse", "error"): Tolerance(1e-5, 1.0, "what is left of F_1 and F_2 by rounding"),
     ("forecast", "mass"): Tolerance(1e-5, 1.0, _FORECAST),
     ("forecast", "window_mass"): Tolerance(1e-5, 1.0, _FORECAST),
     ("forecast", "pose"): Tolerance(1e-5, 1.0, "gathered, and one atan2"),

@@ -24,6 +24,7 @@ EXTRAS = {
     "pyarrow": "data",
     "PIL": "data",
     "matplotlib": "plot",
+    "zuko": "bench",
 }
 """Which extra of the distribution brings a package."""
 

@@ -1,4 +1,4 @@
-"""What an export's parity and an evaluation look like as JSON and as text."""
+"""What an export's parity and a toy's scores look like as JSON and as text."""
 
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
@@ -9,7 +9,6 @@ from hcnaf_cli.output import table
 from hcnaf_runtime.manifest import ParityRow
 
 if TYPE_CHECKING:
-    from hcnaf_export.evaluation import SampleScores, Scores
     from hcnaf_export.training.toy import Divergence
 
 
@@ -58,34 +57,6 @@ def size_text(files: Mapping[str, int], cost: Mapping[str, Any]) -> str:
         ]
         lines.append(table([f"against fp32, {cost['maps']} forecasts ", "mean", "max"], found))
     return "\n".join(lines)
-
-
-def scores_text(scores: "Scores") -> str:
-    """A heading, a line per horizon, and what the numbers can be held against."""
-    head, *rows = scores.table()
-    what = f"{scores.predictor} on {scores.data}, {scores.split}"
-    title = f"{what}: {scores.windows} windows in {scores.clusters} scenes"
-    last = f"mean NLL {scores.mean:.3f} ± {scores.mean_error:.3f}; label noise alone has {scores.floor:.3f}"
-    return "\n".join([title, table(head, rows), last, *(_samples(scores.samples) if scores.samples else [])])
-
-
-def _samples(scores: "SampleScores") -> list[str]:
-    """Scores of the best of k paths, and of samples per horizon."""
-    best = [
-        [
-            f"{p.k}",
-            f"{p.min_ade:.3f} ± {p.min_ade_error:.3f}",
-            f"{p.min_fde:.3f} ± {p.min_fde_error:.3f}",
-            f"{p.miss_rate:.3f} ± {p.miss_rate_error:.3f}",
-        ]
-        for p in scores.paths
-    ]
-    energy = [[f"{e.horizon:g}", f"{e.energy_score:.3f} ± {e.error:.3f}"] for e in scores.energy]
-    return [
-        f"paths coupled by quantiles: {scores.windows} windows in {scores.clusters} scenes, {scores.draws} each",
-        table(["best of k", "min_ade (m)", "min_fde (m)", "miss_rate (2 m)"], best),
-        table(["horizon (s)", "energy_score (m)"], energy),
-    ]
 
 
 def toy_json(found: Sequence["Divergence"]) -> list[dict[str, Any]]:

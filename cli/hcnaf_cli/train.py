@@ -9,11 +9,14 @@ from typing import TYPE_CHECKING, Any, Literal
 import click
 
 from hcnaf_cli.errors import INTERRUPTED, Commands
+from hcnaf_cli.evaluate import evaluate
+from hcnaf_cli.experiment import experiment
 from hcnaf_cli.output import ProgressLine, check_target, duration, show_json, talk, writing
+from hcnaf_cli.reproduce import reproduce
+from hcnaf_cli.temper import temper
 from hcnaf_runtime._version import __version__
 
 if TYPE_CHECKING:
-    from hcnaf_export.checkpoint import Checkpoint
     from hcnaf_export.training.loop import Progress
     from hcnaf_runtime import Scene
 
@@ -42,6 +45,7 @@ def train(
 ) -> None:
     """Train by RECIPE: a TOML file, or the name of a recipe that comes with the package."""
     from hcnaf_export.recipe import read_recipe
+    from hcnaf_export.training.distributed import leads
     from hcnaf_export.training.run import run_training
 
     plan = read_recipe(recipe)
@@ -55,7 +59,9 @@ def train(
             threads=threads,
             progress=lambda p: line(progress_text(p)),
         )
-    if as_json:
+    if not leads():
+        pass  # of several processes one speaks
+    elif as_json:
         show_json(
             {
                 "run": str(result.out),
@@ -70,7 +76,8 @@ def train(
         scores = ", ".join(f"{name}: {value:.4f}" for name, value in result.scores.items())
         click.echo(f"{out}: {result.step} steps in {duration(result.seconds)}; validation: {scores or 'none'}")
     if not result.finished:
-        talk("interrupted; go on with the same command and --resume")
+        if leads():
+            talk("interrupted; go on with the same command and --resume")
         raise click.exceptions.Exit(INTERRUPTED)
 
 
@@ -88,6 +95,9 @@ def progress_text(progress: "Progress") -> str:
     return ", ".join([*parts, f"{duration(progress.left)} left"])
 
 
+main.add_command(experiment)
+main.add_command(reproduce)
+
 _THREE = click.Tuple([click.IntRange(min=1)] * 3)
 
 
@@ -102,12 +112,31 @@ _THREE = click.Tuple([click.IntRange(min=1)] * 3)
 @click.option("--test-net", "test_nets", type=_PATH, multiple=True, help="A .net.xml to test on; repeatable.")
 @click.option("--jobs", type=click.IntRange(min=1), help="Networks simulated at the same time [default: 1].")
 @click.option("--settings", type=_PATH, metavar="TOML", help="All settings, as a file; options override it.")
-def simulate(out: Path, settings: Path | None, **options: Any) -> None:
-    """Make a data set of SUMO traffic on generated or given road networks (extra `sim`)."""
+@click.option(
+    "--format",
+    "layout",
+    type=click.Choice(["tracks", "precog"]),
+    default="tracks",
+    show_default=True,
+    help="precog: one JSON file per snippet, as PRECOG-CARLA.",
+)
+def simulate(out: Path, settings: Path | None, layout: Literal["tracks", "precog"], **options: Any) -> None:
+    """Make a data set of SUMO traffic on generated or given road networks (extra `sim`).
+
+    As precog, snippets have 10 rows of history and 40 of future, 0.2 s apart, the four nearest other cars, and
+    overhead channels that are rendered from the roads and the cars, not scanned.
+    """
     from hcnaf_cli.settings import sim_settings
     from hcnaf_export.data.sim import simulate as make
 
     chosen = sim_settings(settings, options)
+    if layout == "precog":
+        from hcnaf_export.data.precog_write import simulate_precog
+
+        with ProgressLine() as line:
+            made = simulate_precog(out, chosen, lambda text, share: line(f"{share:4.0%}  {text}"))
+        click.echo(f"{out}: " + ", ".join(f"{count} {split} episodes" for split, count in made.items()))
+        return
     with ProgressLine() as line:
         data = make(out, chosen, lambda text, share: line(f"{share:4.0%}  {text}"))
     counts = {split: sum(e.windows for e in sets) for split, sets in data.manifest.splits.items()}
@@ -134,12 +163,21 @@ _scene = click.option("-o", "--out", type=_PATH, required=True, metavar="SCENE.n
     help="Seconds between recorded rows; the files do not say.",
 )
 @click.option("--targets", type=click.Choice(["player", "all"]), default="player", show_default=True)
-def precog(recording: Path, out: Path, step: float, targets: Literal["player", "all"]) -> None:
+@click.option(
+    "--history-step",
+    type=click.FloatRange(min=0, min_open=True),
+    default=0.1,
+    show_default=True,
+    help="Seconds between the scene's rows: 0.2 for a model trained on these episodes.",
+)
+def precog(
+    recording: Path, out: Path, step: float, targets: Literal["player", "all"], history_step: float
+) -> None:
     """A PRECOG-CARLA episode (one JSON file)."""
     from hcnaf_export.data.precog import convert_precog
 
     check_target(out)
-    _save(convert_precog(recording, step=step, targets=targets), out)
+    _save(convert_precog(recording, step=step, targets=targets, target_step=history_step), out)
 
 
 @convert.command()
@@ -250,83 +288,8 @@ def export(
     talk(f"wrote {click.format_filename(out)} ({result.precision}, {result.bytes / 1e6:.2f} MB)")
 
 
-@main.command()
-@click.option("--bundle", type=_PATH, metavar="BUNDLE", help="Score a bundle [default: the embedded one].")
-@click.option("--ckpt", type=_PATH, metavar="model.pt", help="Score a checkpoint, through PyTorch.")
-@click.option("--data", type=_PATH, metavar="DIR", help="Data set of `hcnaf simulate`; toys need none.")
-@click.option("--split", type=click.Choice(["train", "val", "test"]), default="test", show_default=True)
-@click.option("--horizons", metavar="0.5,1,4", help="Seconds ahead [default: every half second].")
-@click.option("--limit", type=click.IntRange(min=0), default=0, help="Score at most about so many windows.")
-@click.option(
-    "--samples-windows",
-    type=click.IntRange(min=0),
-    default=400,
-    show_default=True,
-    help="Score samples of a bundle on at most about so many windows (min_ade_k, miss_rate, energy_score).",
-)
-@click.option(
-    "--record", is_flag=True, help="Keep the scores in the checkpoint; exports carry them in their card."
-)
-@_device
-@_threads
-@_json
-def evaluate(
-    bundle: Path | None,
-    ckpt: Path | None,
-    data: Path | None,
-    split: Literal["train", "val", "test"],
-    horizons: str | None,
-    limit: int,
-    samples_windows: int,
-    record: bool,
-    device: str,
-    threads: int | None,
-    as_json: bool,
-) -> None:
-    """Score a model on held-out traffic: negative log-likelihood, next to a constant-velocity Gaussian."""
-    from hcnaf_cli import tables
-    from hcnaf_cli.inputs import parse_horizons
-    from hcnaf_export import evaluation
+main.add_command(evaluate)
+main.add_command(temper)
 
-    if bundle and ckpt:
-        raise click.UsageError("give --bundle or --ckpt, not both")
-    if record and not ckpt:
-        raise click.UsageError("--record needs --ckpt: scores are kept in a checkpoint")
-    loaded = _checkpoint(ckpt, threads) if ckpt else None
-    if loaded and str(loaded.training.get("task")).startswith("toy"):
-        if record:
-            raise click.UsageError("--record is for forecasts; a toy's divergences are printed only")
-        found = evaluation.evaluate_toy_checkpoint(loaded)
-        show_json(tables.toy_json(found)) if as_json else click.echo(tables.toy_text(found))
-        return
-    if data is None:
-        raise click.UsageError("give the data set to score on as --data")
-    times = parse_horizons(horizons) or evaluation.HORIZONS
-    with ProgressLine() as line:
-        common: dict[str, Any] = {"horizons": times, "limit": limit, "report": lambda share: line(f"{share:4.0%}")}
-        if loaded:
-            scores = evaluation.evaluate_checkpoint(loaded, data, split, device=device, **common)
-        else:
-            scores = evaluation.evaluate_bundle(
-                bundle, data, split, samples=samples_windows, threads=threads, **common
-            )
-    if ckpt and loaded and record:
-        _record(ckpt, loaded, scores.record())
-    show_json(scores.as_dict()) if as_json else click.echo(tables.scores_text(scores))
-
-
-def _record(path: Path, checkpoint: "Checkpoint", scores: dict[str, Any]) -> None:
-    from hcnaf_export.checkpoint import save_checkpoint
-
-    state = checkpoint.model.state_dict()
-    save_checkpoint(path, checkpoint.config, state, checkpoint.training, {**checkpoint.scores, **scores})
-
-
-def _checkpoint(path: Path, threads: int | None) -> "Checkpoint":
-    import torch
-
-    from hcnaf_export.checkpoint import load_checkpoint
-
-    if threads:
-        torch.set_num_threads(threads)
-    return load_checkpoint(path)
+if __name__ == "__main__":  # torchrun -m hcnaf_cli.train
+    main()

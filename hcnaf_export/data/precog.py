@@ -49,6 +49,7 @@ class Episode:
         agent_yaws: [M] degrees relative to the player, clockwise, not wrapped; None if the file has none.
         pixels_per_meter: of the overhead features.
         meters_max: half the width the overhead features cover.
+        episode: the drive it is taken from; scenes of one drive see the same traffic. Empty if the file has none.
     """
 
     player_past: Array
@@ -61,6 +62,7 @@ class Episode:
     agent_yaws: Array | None
     pixels_per_meter: float
     meters_max: float
+    episode: str = ""
 
 
 def read_episode(path: str | PathLike[str]) -> Episode:
@@ -68,9 +70,16 @@ def read_episode(path: str | PathLike[str]) -> Episode:
 
     Raises:
         DataError: a file that cannot be read, is not JSON, or has a field that is missing, of another shape
-            or out of range; the message names the field.
+            or out of range; the message names the file and the field.
     """
     record = _decode(Path(path))
+    try:
+        return _episode(record)
+    except DataError as error:
+        raise DataError(f"{path}: {error}") from error
+
+
+def _episode(record: dict[str, Any]) -> Episode:
     past = _field(record, "player_past", (None, 3))
     future = _field(record, "player_future", (None, 3))
     if len(past) < 2 or len(future) < 1:
@@ -93,6 +102,7 @@ def read_episode(path: str | PathLike[str]) -> Episode:
         agent_yaws=_field(record, "agent_yaws", (count,)) if "agent_yaws" in record else None,
         pixels_per_meter=scale,
         meters_max=reach,
+        episode=str(record.get("episode", "")),
     )
 
 
@@ -126,12 +136,11 @@ def to_scene(
         raise DataError(
             f"step {step} s, target step {target_step} s, {history} rows; expected 0.01-10 s and 1-1000 rows"
         )
-    past = _flipped(np.concatenate([episode.player_past[None], episode.agent_pasts]))
-    future = _flipped(np.concatenate([episode.player_future[None], episode.agent_futures]))
+    past, future, yaw = right_handed(episode)
     count = len(past)
     wanted = np.arange(1 - history, 1, dtype=np.float64) * target_step
     return Scene(
-        past=_history(past, _yaws_now(episode), step, wanted),
+        past=_history(past, yaw, step, wanted),
         size=np.tile(np.asarray(size, dtype=np.float32), (count, 1)),
         kind=np.full(count, KINDS.index("vehicle"), dtype=np.uint8),
         target=np.arange(count if targets == "all" else 1, dtype=np.int64),
@@ -145,14 +154,32 @@ def to_scene(
     )
 
 
-def convert_precog(path: str | PathLike[str], *, step: float = 0.2, targets: Targets = "player") -> Scene:
-    """A PRECOG-CARLA file as a scene with 10 rows of history at 0.1 s; see `read_episode` and `to_scene`."""
-    return to_scene(read_episode(path), step=step, targets=targets)
+def convert_precog(
+    path: str | PathLike[str], *, step: float = 0.2, targets: Targets = "player", target_step: float = 0.1
+) -> Scene:
+    """A PRECOG-CARLA file as a scene with 10 rows of history at `target_step`; see `read_episode`, `to_scene`."""
+    return to_scene(read_episode(path), step=step, targets=targets, target_step=target_step)
+
+
+def right_handed(episode: Episode) -> tuple[Array, Array, Array]:
+    """Positions and headings, the player first, y to the left.
+
+    Returns:
+        past [1 + M, P, 2] and future [1 + M, F, 2] in metres; headings now [1 + M], radians counter-clockwise.
+    """
+    past = _flipped(np.concatenate([episode.player_past[None], episode.agent_pasts]))
+    future = _flipped(np.concatenate([episode.player_future[None], episode.agent_futures]))
+    return past, future, _yaws_now(episode)
+
+
+def histories(past: Array, yaw_now: Array, step: float) -> Array:
+    """Recorded rows as states of a scene: [..., P, 2] m and [...] rad to [..., P, 5] (x, y, sin, cos, speed)."""
+    return states(past, headings(past, yaw_now, step), speeds(past, step))
 
 
 def _history(past: Array, yaw_now: Array, step: float, wanted: Array) -> NDArray[np.float32]:
     times = step * np.arange(1 - past.shape[1], 1)
-    yaw = np.stack([headings(track, now, step) for track, now in zip(past, yaw_now, strict=True)])
+    yaw = headings(past, yaw_now, step)
     moving = np.concatenate([past, yaw[..., None], speeds(past, step)[..., None]], axis=-1)
     row = resample(moving, times, wanted)
     return states(row[..., :2], row[..., 2], row[..., 3]).astype(np.float32)

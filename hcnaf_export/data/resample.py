@@ -54,30 +54,32 @@ def speeds(position: ArrayLike, step: float) -> Array:
     return np.hypot(velocity[..., 0], velocity[..., 1])
 
 
-def headings(position: ArrayLike, yaw_now: float, step: float) -> Array:
-    """Headings of a track whose last heading is known.
+def headings(position: ArrayLike, yaw_now: ArrayLike, step: float) -> Array:
+    """Headings of tracks whose last heading is known.
 
     Going back from the last row, the heading turns as much as the direction of motion does. Rows slower than
     `MOVING` keep the heading of the row after them. Of the two senses of a course the one nearer to the later
     heading counts, so a car that backs up and then drives off does not turn about.
 
     Args:
-        position: [T, 2] metres, T >= 2.
-        yaw_now: heading of the last row, radians.
+        position: [..., T, 2] metres, T >= 2.
+        yaw_now: [...] heading of the last row, radians.
         step: seconds between rows.
 
     Returns:
-        float64 [T], radians, continuous (not wrapped).
+        float64 [..., T], radians, continuous (not wrapped).
     """
-    velocity = np.gradient(np.asarray(position, dtype=np.float64), step, axis=0)
-    course = np.arctan2(velocity[:, 1], velocity[:, 0])
-    moving = np.hypot(velocity[:, 0], velocity[:, 1]) >= MOVING
-    yaw = np.full(len(course), float(yaw_now))
-    later: float | None = None
-    for row in reversed(range(len(course))):
-        turn = half_turn(course[row] - later) if moving[row] and later is not None else 0.0
-        yaw[row] = (yaw[row + 1] if row + 1 < len(yaw) else yaw_now) + turn
-        later = course[row] if moving[row] else later
+    velocity = np.gradient(np.asarray(position, dtype=np.float64), step, axis=-2)
+    course = np.arctan2(velocity[..., 1], velocity[..., 0])
+    moving = np.hypot(velocity[..., 0], velocity[..., 1]) >= MOVING
+    yaw = np.empty(course.shape)
+    after = np.broadcast_to(np.asarray(yaw_now, dtype=np.float64), course.shape[:-1])
+    later = np.full(course.shape[:-1], np.nan)
+    for row in reversed(range(course.shape[-1])):
+        turns = moving[..., row] & np.isfinite(later)
+        after = after + np.where(turns, half_turn(course[..., row] - np.where(turns, later, 0.0)), 0.0)
+        yaw[..., row] = after
+        later = np.where(moving[..., row], course[..., row], later)
     return yaw
 
 

@@ -1,64 +1,49 @@
-"""Things that give densities to the labels of windows: a bundle, a checkpoint (and `hcnaf_export.baselines`)."""
+"""An exported bundle as a predictor (`checkpoint_predictor` and `hcnaf_export.baselines` have others)."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
-from typing import Protocol, runtime_checkable
 
 import numpy as np
-import torch
-from numpy.typing import NDArray
 
-from hcnaf_export.baselines import label_steps, labels
-from hcnaf_export.checkpoint import Checkpoint
+from hcnaf_export.baselines import labels
 from hcnaf_export.data.tracks import TrackSet
-from hcnaf_export.training.pom import score
-from hcnaf_export.training.sampling import FixedWindows
-from hcnaf_export.training.windows import WindowPool
-from hcnaf_models.config import PomConfig
-from hcnaf_runtime.errors import CheckpointError, HorizonError
+from hcnaf_export.evaluation.capabilities import Float, Float32, Int, Windows
+from hcnaf_export.evaluation.capabilities import Predictor as Predictor
+from hcnaf_export.evaluation.capabilities import Sampler as Sampler
+from hcnaf_runtime import frames
 from hcnaf_runtime.forecaster import Forecaster
+from hcnaf_runtime.grid import Grid
 from hcnaf_runtime.scene import Scene
 
-Float = NDArray[np.float64]
-Windows = NDArray[np.int32]
-
-NEIGHBOURS = 32
-"""Others given to a checkpoint, nearest first; it picks those it reads."""
-
-
-class Predictor(Protocol):
-    """A conditional density of future positions."""
-
-    @property
-    def name(self) -> str:
-        """What it is called in tables."""
-
-    def nll(self, tracks: TrackSet, windows: Windows, horizons: Sequence[float]) -> Float:
-        """-log p of the recorded labels (nats per m²), [W, Q], of windows [W, 2] (track, step) at horizons (s)."""
-
-
-@runtime_checkable
-class Sampler(Protocol):
-    """What can draw paths too."""
-
-    @property
-    def draws(self) -> bool:
-        """Whether this one can."""
-
-    def paths(self, tracks: TrackSet, windows: Windows, horizons: Sequence[float], count: int) -> Float:
-        """`count` paths per window [W, count, Q, 2] (m, the network's frame), horizons coupled by quantiles."""
+TOLERANCE = 1e-4
+"""Of a cell's mass: reliability tells nothing finer."""
 
 
 class BundlePredictor:
     """An exported bundle on the path a vehicle takes: one `Scene` per window, its ego the only target.
 
-    The scene is what `TrackSet.scene` makes of it: agents within 60 m, the map within 80 m.
+    The scene is what `TrackSet.scene` makes of it: agents within 60 m, the map within 80 m. Samples are the same
+    whatever other windows are scored. See `capabilities` for what the methods give.
     """
 
     def __init__(self, forecaster: Forecaster, name: str = "bundle") -> None:
         self.forecaster, self.name = forecaster, name
+
+    @property
+    def draws(self) -> bool:
+        """Bundles from before there were samples cannot."""
+        return self._has("inverse")
+
+    @property
+    def transforms(self) -> bool:
+        """Flows of two dimensions can."""
+        return self._has("marginal_cdf", "conditional_cdf")
+
+    @property
+    def maps(self) -> bool:
+        """Flows of two dimensions can."""
+        return self._has("cell_mass")
 
     def nll(self, tracks: TrackSet, windows: Windows, horizons: Sequence[float]) -> Float:
         """See `Predictor.nll`."""
@@ -69,20 +54,57 @@ class BundlePredictor:
             out[i] = -self.forecaster.log_prob(scene, local, horizons, frame="scene")[0, :, 0]
         return out
 
-    @property
-    def draws(self) -> bool:
-        """See `Sampler.draws`: bundles from before there were samples cannot."""
-        return "inverse" in self.forecaster.bundle.manifest.graphs
-
     def paths(self, tracks: TrackSet, windows: Windows, horizons: Sequence[float], count: int) -> Float:
-        """See `Sampler.paths`. A window's draws are the same whatever other windows are scored."""
+        """See `Sampler.paths`."""
         out = np.empty((len(windows), count, len(horizons), 2))
         for i, (scene, centre) in enumerate(_scenes(tracks, windows)):
-            track, step = windows[i].tolist()
-            seed = track * 1_000_003 + step
-            made = self.forecaster.trajectories(scene, count, horizons, seed, "scene")
+            made = self.forecaster.trajectories(scene, count, horizons, seed_of(windows[i]), "scene")
             out[i] = made.points[0].transpose(1, 0, 2) + centre
         return out
+
+    def drawn_log_prob(self, tracks: TrackSet, windows: Windows, horizons: Sequence[float], count: int) -> Float32:
+        """See `Drawer.drawn_log_prob`."""
+        drawn = [
+            self.forecaster.sample(scene, count, horizons, seed_of(window)).log_prob[0]
+            for window, (scene, _) in zip(windows, _scenes(tracks, windows), strict=True)
+        ]
+        return np.stack(drawn)
+
+    def pit(self, tracks: TrackSet, windows: Windows, horizons: Sequence[float]) -> Float:
+        """See `Transformer.pit`."""
+        out = np.empty((len(windows), len(horizons), 2))
+        for i, (scene, points) in enumerate(self._labelled(tracks, windows, horizons)):
+            out[i] = self.forecaster.cdf(scene, points[None, :, None], horizons)[0, :, 0]
+        return out
+
+    def cells(
+        self, tracks: TrackSet, windows: Windows, horizons: Sequence[float], grid: Grid
+    ) -> tuple[Float32, Int]:
+        """See `Mapper.cells`. Cells are exact up to TOLERANCE."""
+        mass = np.empty((len(windows), len(horizons), grid.height, grid.width), np.float32)
+        where = np.empty((len(windows), len(horizons)), np.int64)
+        for i, (scene, points) in enumerate(self._labelled(tracks, windows, horizons)):
+            mass[i] = self.forecaster.pom(scene, grid, horizons, tolerance=TOLERANCE).mass[0]
+            where[i] = cell_of(points, grid)
+        return mass, where
+
+    def _has(self, *graphs: str) -> bool:
+        return set(graphs) <= set(self.forecaster.bundle.manifest.graphs)
+
+    def _labelled(
+        self, tracks: TrackSet, windows: Windows, horizons: Sequence[float]
+    ) -> Iterator[tuple[Scene, Float]]:
+        """Each window's scene, and its labels [Q, 2] in the agent's frame (m)."""
+        points = labels(tracks, windows, horizons)
+        for i, (scene, centre) in enumerate(_scenes(tracks, windows)):
+            yield scene, frames.to_agent(points[i] - centre, self.forecaster.theta(scene, horizons).pose[0])
+
+
+def cell_of(points: Float, grid: Grid) -> Int:
+    """The cell of `grid` that holds each of `points` [..., 2] (m): row-major, -1 where none does."""
+    column, row = np.moveaxis(np.floor((points - grid.corners[0]) / grid.resolution).astype(np.int64), -1, 0)
+    inside = (column >= 0) & (column < grid.width) & (row >= 0) & (row < grid.height)
+    return np.where(inside, row * grid.width + column, -1)
 
 
 def _scenes(tracks: TrackSet, windows: Windows) -> Iterator[tuple[Scene, Float]]:
@@ -92,27 +114,7 @@ def _scenes(tracks: TrackSet, windows: Windows) -> Iterator[tuple[Scene, Float]]
         yield tracks.scene(track, step, max_targets=1), centre
 
 
-class CheckpointPredictor:
-    """A checkpoint, in batches through PyTorch: fast, and the yardstick of the bundle.
-
-    Raises:
-        CheckpointError: not a model of occupancy forecasts.
-    """
-
-    def __init__(self, checkpoint: Checkpoint, name: str = "checkpoint", device: str = "cpu") -> None:
-        if not isinstance(checkpoint.config, PomConfig):
-            raise CheckpointError(
-                f"the checkpoint is of kind {checkpoint.config.kind}, tracks need a model of kind pom"
-            )
-        self.name, self.config, self.device = name, checkpoint.config, torch.device(device)
-        self.model = checkpoint.model.to(self.device)
-
-    def nll(self, tracks: TrackSet, windows: Windows, horizons: Sequence[float]) -> Float:
-        """See `Predictor.nll`."""
-        label_steps(horizons)
-        if max(horizons) > self.config.horizon + 1e-6:
-            raise HorizonError(
-                f"horizon {max(horizons):g} s, the model was trained up to {self.config.horizon:g} s; ask for less"
-            )
-        pool = WindowPool([replace(tracks, windows=windows)], self.config, NEIGHBOURS)
-        return score(self.model, FixedWindows(pool, tuple(horizons)), self.device)
+def seed_of(window: Windows) -> int:
+    """What a window's draws follow from."""
+    track, step = window.tolist()
+    return int(track * 1_000_003 + step)

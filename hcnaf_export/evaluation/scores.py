@@ -8,7 +8,11 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from hcnaf_export.evaluation.extra_nats import ExtraNats
 from hcnaf_export.evaluation.paths import SampleScores
+from hcnaf_export.evaluation.pit import PitScores
+from hcnaf_export.evaluation.regions import RegionScores
+from hcnaf_export.evaluation.reliability import ReliabilityScores
 from hcnaf_export.evaluation.spread import mean_and_error as mean_and_error
 
 
@@ -40,7 +44,11 @@ class Scores(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         windows: snippets scored. clusters: groups of them that are taken as independent.
         rows: one per horizon.
         mean: mean NLL over the horizons, nats per m². mean_error: its standard error.
-        floor: entropy of the label noise, nats per m²; no predictor's expected NLL lies below it.
+        floor: entropy of the label noise, nats per m²; no predictor's expected NLL lies below it. None where the
+            labels' noise is not known.
+        extra_nats: of each protocol; the plain NLL in nats per m² and step that goes with them is `rows`.
+        pit, hdr_coverage, reliability: calibration, each where the predictor allows it.
+        network: the one network of the split that was scored, None for all of them.
         samples: scores of samples and paths, of a predictor that draws them.
     """
 
@@ -52,8 +60,19 @@ class Scores(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     rows: tuple[Score, ...]
     mean: float
     mean_error: float
-    floor: float
+    floor: float | None
     samples: SampleScores | None = None
+    extra_nats: tuple[ExtraNats, ...] = ()
+    pit: PitScores | None = None
+    hdr_coverage: RegionScores | None = None
+    reliability: ReliabilityScores | None = None
+    network: str | None = None
+
+    @property
+    def title(self) -> str:
+        """Such as: bundle on simdata, test: 5000 windows in 240 scenes."""
+        where = self.split if self.network is None else f"{self.split}, {self.network}"
+        return f"{self.predictor} on {self.data}, {where}: {self.windows} windows in {self.clusters} scenes"
 
     def as_dict(self) -> dict[str, Any]:
         """Plain data, fit for JSON."""
@@ -73,8 +92,22 @@ class Scores(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             f"{self.split} constant velocity": column("baseline"),
             f"{self.split} windows": self.windows,
             f"{self.split} floor of the label noise": self.floor,
+            **self._calibration(),
             **(self.samples.record(self.split) if self.samples else {}),
         }
+
+    def _calibration(self) -> dict[str, dict[str, float]]:
+        """Columns by horizon: the larger KS statistic, coverage of the widest regions, the ECE."""
+        found = {}
+        if self.pit:
+            found["PIT KS"] = {f"{r.horizon:g} s": max(r.along.ks, r.across.ks) for r in self.pit.rows}
+        if self.hdr_coverage:
+            widest = max(r.level for r in self.hdr_coverage.rows)
+            inside = [r for r in self.hdr_coverage.rows if r.level == widest]
+            found[f"coverage of {widest:.0%} regions"] = {f"{r.horizon:g} s": r.covered for r in inside}
+        if self.reliability:
+            found["ECE"] = {f"{r.horizon:g} s": r.ece for r in self.reliability.rows}
+        return {f"{self.split} {name}": column for name, column in found.items()}
 
     def table(self) -> list[tuple[str, ...]]:
         """Header and rows of text, one row per horizon: NLLs and gain with their standard errors."""

@@ -16,9 +16,12 @@ import torch
 from torch import Tensor
 
 from hcnaf_export.recipe import Optimiser, Recipe
+from hcnaf_export.training.distributed import SOLO, Team
 from hcnaf_export.training.interrupt import Interrupt
 from hcnaf_export.training.journal import Journal
+from hcnaf_export.training.precision import Precision
 from hcnaf_export.training.prefetch import Prefetch
+from hcnaf_export.training.share import WHOLE, Share
 from hcnaf_export.training.state import RunState
 from hcnaf_models.model import Hcnaf
 from hcnaf_runtime.errors import TrainingError
@@ -39,8 +42,8 @@ class Task(Protocol):
     facts: dict[str, Any]
     """What a model card says about the data."""
 
-    def batch(self, step: int) -> Any:
-        """The batch of a step, on the CPU."""
+    def batch(self, step: int, share: Share = WHOLE) -> Any:
+        """The batch of a step, or a process's share of it, on the CPU."""
 
     def loss(self, model: Hcnaf, batch: Any) -> Tensor:
         """The mean negative log-likelihood, nats."""
@@ -77,6 +80,8 @@ class Loop:
         out: the run directory, for `checkpoint.pt` and `metrics.jsonl`.
         device: of the model.
         report: told how far it is, every few seconds and after each validation.
+        team: the processes that train together; the leader alone validates, writes and reports.
+        loaders: threads that make batches.
     """
 
     def __init__(
@@ -88,10 +93,15 @@ class Loop:
         *,
         device: torch.device,
         report: Report | None = None,
+        team: Team = SOLO,
+        loaders: int = 1,
     ) -> None:
         self.task, self.state, self.recipe, self.out = task, state, recipe, out
         self.settings: Optimiser = recipe.optimiser
-        self.device, self.report = device, report
+        self.device, self.report, self.team, self.loaders = device, report, team, loaders
+        self.precision = Precision(self.settings.precision, device)
+        self.precision.state = state.scaler
+        self.objective = team.objective(state.model, task.loss)
         self.journal = Journal(out / "metrics.jsonl")
         self.loss, self.scores = math.nan, None if not state.best else state.best
         self._mark = self._saved = self._reported = time.monotonic()
@@ -104,14 +114,19 @@ class Loop:
         Raises:
             TrainingError: several bad steps in a row.
         """
-        state, last = self.state, self.settings.steps
-        with Interrupt() as interrupt, Prefetch(self.task.batch, state.step, last) as batches:
+        state, stop = self.state, False
+        with (
+            Interrupt() as interrupt,
+            self.precision.lowered(state.model),
+            Prefetch(self._batch, state.step, self.settings.steps, self.loaders) as batches,
+        ):
             for batch in batches:
                 self._step(batch)
                 self._housekeeping()
-                if interrupt.requested or self.share >= 1.0:
+                state.seconds, stop = self.team.agree(state.seconds, interrupt.requested)
+                if stop or self.share >= 1.0:
                     break
-        if interrupt.requested and self.share < 1.0:
+        if stop and self.share < 1.0:
             self._save()
             return False
         if self._validated != state.step:
@@ -125,6 +140,9 @@ class Loop:
         spent = self.state.seconds / (60.0 * self.settings.minutes) if self.settings.minutes else 0.0
         return max(self.state.step / self.settings.steps, spent)
 
+    def _batch(self, step: int) -> Any:
+        return self.task.batch(step) if self.team.size == 1 else self.task.batch(step, self.team.share)
+
     def _step(self, batch: Any) -> None:
         state = self.state
         units_only = state.step < self.settings.units_first
@@ -134,18 +152,20 @@ class Loop:
             group["lr"] = rate
         state.model.train()
         state.optimiser.zero_grad(set_to_none=True)
-        loss = self.task.loss(state.model, to_device(batch, self.device))
-        loss.backward()  # type: ignore[no-untyped-call]
+        loss = self.objective(to_device(batch, self.device))
+        self.precision.backward(loss, state.optimiser)
         if units_only:
             _keep_units(state.model)
         norm = torch.nn.utils.clip_grad_norm_(state.model.parameters(), self.settings.clip)
-        value, finite = float(loss.detach()), bool(torch.isfinite(norm))
+        value = self.team.mean(loss)
+        good = bool(torch.isfinite(norm)) and math.isfinite(value)
         state.step += 1
-        if not (finite and math.isfinite(value)):
+        self.precision.step(state.optimiser, good)
+        if not good:
             self._count_bad()
             return
-        state.optimiser.step()
-        state.average.update(state.model)
+        if self.team.leads:
+            state.average.update(state.model)
         state.bad_in_a_row = 0
         self.loss = value if math.isnan(self.loss) else self.loss + 0.02 * (value - self.loss)
 
@@ -163,6 +183,8 @@ class Loop:
         now = time.monotonic()
         self.state.seconds += now - self._mark
         self._mark = now
+        if not self.team.leads:
+            return
         if self.state.step % self.settings.validate_every == 0:
             self._validate()
         if now - self._saved > SAVE_EVERY:
@@ -189,6 +211,8 @@ class Loop:
 
     def _validate(self) -> None:
         """Score the average; its weights are copied if they are the best so far."""
+        if not self.team.leads:
+            return
         state = self.state
         self.scores, self._validated = self.task.validate(state.average.model), state.step
         self.journal.write(step=state.step, seconds=round(state.seconds, 1), validation=self.scores)
@@ -205,6 +229,9 @@ class Loop:
         self._counted = state.step
 
     def _save(self) -> None:
+        if not self.team.leads:
+            return
+        self.state.scaler = self.precision.state
         self.state.save(self.out / "checkpoint.pt", self.recipe)
         self._saved = time.monotonic()
 
@@ -218,7 +245,7 @@ def schedule(settings: Optimiser, step: int, share: float) -> float:
 
 def _keep_units(model: Hcnaf) -> None:
     """Drop all gradients but those of the location and the scale."""
-    units = {id(p) for p in model.hypernet.head.units.parameters()}
+    units = {id(p) for p in model.head.units.parameters()}
     for p in model.parameters():
         if id(p) not in units:
             p.grad = None

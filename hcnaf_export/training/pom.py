@@ -13,6 +13,7 @@ from hcnaf_export.data.tracks import FUTURE, STEP, Dataset
 from hcnaf_export.recipe import PomRecipe, Windows
 from hcnaf_export.training.loop import to_device
 from hcnaf_export.training.sampling import FixedWindows, WindowSampler
+from hcnaf_export.training.share import WHOLE, Share
 from hcnaf_export.training.windows import PomBatch, WindowPool
 from hcnaf_models.config import PomConfig
 from hcnaf_models.model import Hcnaf
@@ -48,9 +49,9 @@ class PomTask:
             "nll_floor": dataset.manifest.nll_floor,
         }
 
-    def batch(self, step: int) -> PomBatch:
+    def batch(self, step: int, share: Share = WHOLE) -> PomBatch:
         """Training windows of a step."""
-        return self.sampler.batch(step)
+        return self.sampler.batch(step, share)
 
     def loss(self, model: Hcnaf, batch: PomBatch) -> Tensor:
         """Mean over windows, horizons and draws, nats per m²."""
@@ -65,9 +66,14 @@ class PomTask:
 
 def log_prob(model: Hcnaf, batch: PomBatch) -> Tensor:
     """log p of a batch's points, [B, Q, M] in nats per m²."""
+    return model.log_prob(theta_of(model, batch), batch.points)
+
+
+def theta_of(model: Hcnaf, batch: PomBatch) -> Tensor:
+    """theta [B, Q, P] of a batch's windows and horizons."""
     hypernet = model.hypernet
     assert isinstance(hypernet, PomHyperNet)
-    theta = hypernet(
+    theta: Tensor = hypernet(
         batch.reference,
         batch.reference_size,
         batch.horizons,
@@ -76,7 +82,7 @@ def log_prob(model: Hcnaf, batch: PomBatch) -> Tensor:
         stops=batch.stops,
         crop=batch.crop,
     )
-    return model.log_prob(theta, batch.points)
+    return theta
 
 
 @torch.no_grad()

@@ -23,13 +23,28 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from hcnaf_export.baselines import build
 from hcnaf_export.checkpoint import save_checkpoint
-from hcnaf_export.recipe import PomRecipe, Recipe, to_toml
+from hcnaf_export.recipe import (
+    MnistRecipe,
+    PlanarRecipe,
+    PomRecipe,
+    PrecogRecipe,
+    Recipe,
+    ToyRecipe,
+    TrackRecipe,
+    to_toml,
+)
+from hcnaf_export.training.distributed import SOLO, Team, team
+from hcnaf_export.training.eth_ucy import TrackTask
 from hcnaf_export.training.loop import Loop, Progress, Task
 from hcnaf_export.training.pom import PomTask
+from hcnaf_export.training.precision import check_precision
+from hcnaf_export.training.precog import PrecogTask
+from hcnaf_export.training.prefetch import loaders
 from hcnaf_export.training.state import RunState
 from hcnaf_export.training.toy import ToyTask
-from hcnaf_models.model import Hcnaf, build
+from hcnaf_models.model import Hcnaf
 from hcnaf_runtime._version import __version__
 from hcnaf_runtime.errors import CheckpointError, RecipeError
 
@@ -63,11 +78,15 @@ def run_training(
     threads: int | None = None,
     progress: Callable[[Progress], None] | None = None,
 ) -> TrainingResult:
-    """Train by a recipe.
+    """Train by a recipe; in a process that torchrun started, together with the others it started.
+
+    Of several processes the leader alone uses `out` and `progress`; the result is the same in all but for the
+    scores, which only the leader has.
 
     Args:
         recipe: what to train and how.
-        data: a data set of `hcnaf simulate`, for POM recipes; toys need none.
+        data: a data set of `hcnaf simulate` for POM recipes, the ETH/UCY recordings for pedestrians, the idx files
+            of MNIST; toys need none.
         out: the run directory; must be new or empty unless `resume`.
         resume: go on from `out`, exactly where it stopped (the same batches in the same order).
         device: `cpu`, `cuda` or `cuda:N`.
@@ -75,36 +94,70 @@ def run_training(
         progress: told every few seconds, and after each validation.
 
     Raises:
-        RecipeError: data missing, or a device that is not there.
+        RecipeError: data missing, a device that is not there or not enough of them, a precision that the device
+            does not have, or a batch that the processes cannot share evenly.
         DataError: the data set cannot be read or lacks what the model reads.
         CheckpointError: nothing to resume from, a run of another recipe, or `out` is not empty.
         TrainingError: training diverged.
     """
     place = _device(device)
-    check_target(out, resume)
-    with _threads(threads):
-        task = make_task(recipe, data, place)
-        out.mkdir(parents=True, exist_ok=True)  # only now: bad data leaves no directory behind
-        state = RunState.start(_fresh(recipe).to(place), recipe.optimiser)
+    check_precision(recipe.optimiser.precision, place)
+    with team(place) as crew, _threads(threads):
+        crew.share.of(recipe.optimiser.batch)
+        crew.lead(lambda: check_target(out, resume))
+        if isinstance(recipe, MnistRecipe):
+            from hcnaf_export.training.mnist import run_mnist  # which builds on this module
+
+            return run_mnist(recipe, data, out, resume=resume, team=crew, progress=progress)
+        task = make_task(recipe, data, crew.device)
+        state = RunState.start(_fresh(recipe).to(crew.device), recipe.optimiser)
+        return carry_out(task, state, recipe, out, resume=resume, team=crew, progress=progress)
+
+
+def carry_out(
+    task: Task,
+    state: RunState,
+    recipe: Recipe,
+    out: Path,
+    *,
+    resume: bool = False,
+    team: Team = SOLO,
+    progress: Callable[[Progress], None] | None = None,
+) -> TrainingResult:
+    """Train from `state`, or from where the run in `out` stopped, and write what a run leaves."""
+
+    def prepare() -> bytes | None:
         if resume:
-            state.restore(out / "checkpoint.pt", recipe)
-        else:
-            (out / "recipe.toml").write_text(to_toml(recipe), encoding="utf-8")
-        loop = Loop(task, state, recipe, out, device=place, report=progress)
-        finished = loop.run()
-    _write_models(state, recipe, out, _facts(recipe, state, task, place))
+            return (out / "checkpoint.pt").read_bytes()
+        out.mkdir(parents=True, exist_ok=True)  # only now: bad data leaves no directory behind
+        (out / "recipe.toml").write_text(to_toml(recipe), encoding="utf-8")
+        return None
+
+    if (content := team.lead(prepare)) is not None:
+        state.restore(out / "checkpoint.pt", recipe, content)
+    threads = loaders(team.device)
+    finished = Loop(
+        task, state, recipe, out, device=team.device, report=progress, team=team, loaders=threads
+    ).run()
+    about = facts(recipe, state, task, team.device) | team.facts
+    team.lead(lambda: write_models(state, recipe, out, about))
     return TrainingResult(out, finished, state.step, state.seconds, state.bad, state.best)
 
 
-def make_task(recipe: Recipe, data: Path | None, device: torch.device) -> PomTask | ToyTask:
+def make_task(
+    recipe: PlanarRecipe, data: Path | None, device: torch.device
+) -> PomTask | PrecogTask | ToyTask | TrackTask:
     """The task of a recipe. Raises RecipeError if it needs data and none was given."""
-    if not isinstance(recipe, PomRecipe):
+    if isinstance(recipe, ToyRecipe):
         return ToyTask(recipe, device)
     if data is None:
-        raise RecipeError(
-            f"recipe {recipe.name} needs a data set; make one with hcnaf simulate and give it as --data"
+        source = {PomRecipe: "make one with hcnaf simulate", TrackRecipe: "download ETH/UCY"}.get(
+            type(recipe), "download PRECOG-CARLA, or make one with hcnaf simulate --format precog"
         )
-    return PomTask(recipe, data, device)
+        raise RecipeError(f"recipe {recipe.name} needs a data set; {source} and give it as --data")
+    if isinstance(recipe, PrecogRecipe):
+        return PrecogTask(recipe, data, device)
+    return PomTask(recipe, data, device) if isinstance(recipe, PomRecipe) else TrackTask(recipe, data, device)
 
 
 def check_target(out: Path, resume: bool) -> None:
@@ -117,14 +170,14 @@ def check_target(out: Path, resume: bool) -> None:
         raise CheckpointError(f"{out} is not empty; resume it, or choose a new directory")
 
 
-def _fresh(recipe: Recipe) -> Hcnaf:
+def _fresh(recipe: PlanarRecipe) -> Hcnaf:
     """A model that follows from the recipe's seed; torch's generator is left as it was."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(recipe.seed)
         return build(recipe.model)
 
 
-def _write_models(state: RunState, recipe: Recipe, out: Path, facts: dict[str, Any]) -> None:
+def write_models(state: RunState, recipe: Recipe, out: Path, facts: dict[str, Any]) -> None:
     last: dict[str, Tensor] = state.average.model.state_dict()
     best = state.best_weights or last
     at = state.best_step if state.best_weights else state.step
@@ -134,7 +187,7 @@ def _write_models(state: RunState, recipe: Recipe, out: Path, facts: dict[str, A
     save_checkpoint(out / "last.pt", recipe.model, last, {**facts, "weights_of_step": state.step}, {})
 
 
-def _facts(recipe: Recipe, state: RunState, task: Task, device: torch.device) -> dict[str, Any]:
+def facts(recipe: Recipe, state: RunState, task: Task, device: torch.device) -> dict[str, Any]:
     """What a model card says about how the weights came about."""
     return {
         "recipe": recipe.name,

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from hcnaf_export.data.tracks import FUTURE, STEP, NoiseModel
 from hcnaf_export.recipe import Windows
+from hcnaf_export.training.share import WHOLE, Share
 from hcnaf_export.training.windows import Int, Perception, PomBatch, WindowPool
 from hcnaf_models.geometry import pose_of
 from hcnaf_models.raster import pixel_centres
@@ -37,8 +38,11 @@ class WindowSampler:
         self.per_epoch = len(pool) // self.size
         self._order: tuple[int, Int] = (-1, np.zeros(0, np.int64))
 
-    def batch(self, step: int) -> PomBatch:
-        """The batch of a step, counted from 0; an epoch visits every window at most once."""
+    def batch(self, step: int, share: Share = WHOLE) -> PomBatch:
+        """The batch of a step, counted from 0; an epoch visits every window at most once.
+
+        Of a share, what is drawn at random is drawn for the whole batch, and the rest is done for the share alone.
+        """
         index = self._windows(step)
         rng = np.random.default_rng((self.seed, 1, step))
         rows = self.pool.rows(index, self.settings.shift, rng)
@@ -50,17 +54,19 @@ class WindowSampler:
         past[rng.random(len(index)) < self.settings.lone, 1:] = np.nan
         horizons = self._horizons(len(index), rng)
         points = self._labels(rows.now, horizons, rng)
-        batch = self.pool.batch(index, past, horizons, points)
+        mine = share.of(len(index))
+        batch = self.pool.batch(index[mine], past[mine], horizons[mine], points[mine])
         if batch.crop is not None:
-            self._shorten(batch.crop, pose_of(batch.reference), rng)
+            self._shorten(batch.crop, pose_of(batch.reference), rng, share)
         return batch
 
     def _windows(self, step: int) -> Int:
         epoch, place = divmod(step, self.per_epoch)
-        if self._order[0] != epoch:
+        known, order = self._order  # read at once: several threads may make batches
+        if known != epoch:
             order = np.random.default_rng((self.seed, 0, epoch)).permutation(len(self.pool))
             self._order = (epoch, order)
-        return self._order[1][place * self.size : (place + 1) * self.size]
+        return order[place * self.size : (place + 1) * self.size]
 
     def _horizons(self, B: int, rng: np.random.Generator) -> Float:
         """[B, Q], uniform over (0, longest]: one in each of Q equal parts, so that every window sees all of it."""
@@ -79,23 +85,31 @@ class WindowSampler:
         noise = np.float32(self.noise.label) * rng.standard_normal(shape, dtype=np.float32)
         return np.asarray(truth[:, :, None] + noise, np.float32)
 
-    def _shorten(self, crop: Tensor, pose: Tensor, rng: np.random.Generator) -> None:
+    def _shorten(self, crop: Tensor, pose: Tensor, rng: np.random.Generator, share: Share) -> None:
         """Take away maps, channels, and what lies outside a vehicle's own map window; in place."""
-        channels, B = self.pool.config.channels, len(crop)
+        channels, B = self.pool.config.channels, share.parts * len(crop)
+        mine = share.of(B)
         for name in self.settings.optional:
             if name in channels:
-                lost = torch.from_numpy(rng.random(B) < self.settings.no_channel)
+                lost = torch.from_numpy((rng.random(B) < self.settings.no_channel)[mine])
                 crop[lost, channels.index(name)] = 0.0
-        for i in np.flatnonzero(rng.random(B) < self.settings.short_map):
-            crop[i] *= self._near(pose[i : i + 1], rng)[0]
+        short = rng.random(B) < self.settings.short_map
+        where = np.zeros((B, 2))
+        where[short] = rng.random((np.count_nonzero(short), 2))
+        short, where = short[mine], where[mine]
+        for i in np.flatnonzero(short):
+            crop[i] *= self._near(pose[i : i + 1], where[i : i + 1])[0]
         gone = rng.random(B) < self.settings.no_map
-        crop[torch.from_numpy(gone), :-1] = 0.0
-        crop[torch.from_numpy(gone & (rng.random(B) < 0.5))] = 0.0
+        crop[torch.from_numpy(gone[mine]), :-1] = 0.0
+        crop[torch.from_numpy((gone & (rng.random(B) < 0.5))[mine])] = 0.0
 
-    def _near(self, pose: Tensor, rng: np.random.Generator) -> Tensor:
-        """1 within `map_reach` of a point at most `map_shift` away (squares), [B, 1, rows, columns]."""
-        radius = self.settings.map_shift * np.sqrt(rng.random(len(pose)))
-        angle = 2.0 * np.pi * rng.random(len(pose))
+    def _near(self, pose: Tensor, uniform: NDArray[np.float64]) -> Tensor:
+        """1 within `map_reach` of a point at most `map_shift` away (squares), [B, 1, rows, columns].
+
+        The point follows from uniform [B, 2].
+        """
+        radius = self.settings.map_shift * np.sqrt(uniform[:, 0])
+        angle = 2.0 * np.pi * uniform[:, 1]
         shift = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=-1).astype(np.float32)
         centre = pose[:, :2] + torch.from_numpy(shift)
         x, y = pixel_centres(self.pool.config.crop, pose)

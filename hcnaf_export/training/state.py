@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import tempfile
 from dataclasses import dataclass, field
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +34,8 @@ class RunState:
     best: dict[str, float] = field(default_factory=dict)
     best_step: int = -1
     best_weights: dict[str, Tensor] = field(default_factory=dict)
+    scaler: dict[str, Any] = field(default_factory=dict)
+    """Of mixed precision, where it has one."""
 
     @classmethod
     def start(cls, model: Hcnaf, settings: Optimiser) -> RunState:
@@ -59,29 +62,32 @@ class RunState:
             "averaged": self.average.count,
             "optimiser": self.optimiser.state_dict(),
             "best_weights": self.best_weights,
+            "scaler": self.scaler,
             **counters,
         }
         replace(path, content)
 
-    def restore(self, path: Path, recipe: Recipe) -> None:
-        """Take over the file that `save` wrote.
+    def restore(self, path: Path, recipe: Recipe, content: bytes | None = None) -> None:
+        """Take over the file that `save` wrote; with `content`, what another process read from it.
 
         Raises:
             CheckpointError: unreadable, not a run's state, or of another recipe.
         """
         try:
-            content = torch.load(path, map_location="cpu", weights_only=True)
-            same = from_plain(content["recipe"]) == recipe
+            source = path if content is None else BytesIO(content)
+            found = torch.load(source, map_location="cpu", weights_only=True)
+            same = from_plain(found["recipe"]) == recipe
         except Exception as error:
             raise CheckpointError(f"{path} is not the state of a run; remove it and start again") from error
-        if content.get("format") != FORMAT or not same:
+        if found.get("format") != FORMAT or not same:
             raise CheckpointError(f"{path} belongs to another recipe; resume with the run's own recipe.toml")
-        self.model.load_state_dict(content["model"])
-        self.average.model.load_state_dict(content["average"])
-        self.average.count = content["averaged"]
-        self.optimiser.load_state_dict(content["optimiser"])
+        self.model.load_state_dict(found["model"])
+        self.average.model.load_state_dict(found["average"])
+        self.average.count = found["averaged"]
+        self.optimiser.load_state_dict(found["optimiser"])
+        self.scaler = found.get("scaler", {})  # runs of older versions have none
         for name in (*_COUNTERS, "best_weights"):
-            setattr(self, name, content[name])
+            setattr(self, name, found[name])
 
 
 _COUNTERS = ("step", "seconds", "bad", "bad_in_a_row", "best", "best_step")

@@ -8,14 +8,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hcnaf_export.data.toys import Toy, ToyOne, ToyTwo
+from hcnaf_export.data.toys import Toy, ToyOne, ToyTwo, even
 from hcnaf_export.recipe import ToyRecipe
+from hcnaf_export.training.share import WHOLE, Share
+from hcnaf_models import fused
 from hcnaf_models.model import Hcnaf
 from hcnaf_runtime.errors import RecipeError
 
 
 class ToyBatch(NamedTuple):
-    """Samples of every seen condition."""
+    """Samples of every seen condition, spread evenly (`data.toys.even`)."""
 
     condition: Tensor  # [A, K]
     points: Tensor  # [A, N, 2]
@@ -46,16 +48,16 @@ class ToyTask:
         self.examples = self.draws * len(self.toy.seen)
         self.facts: dict[str, Any] = {"data": recipe.task}
 
-    def batch(self, step: int) -> ToyBatch:
-        """Fresh samples of every seen condition."""
+    def batch(self, step: int, share: Share = WHOLE) -> ToyBatch:
+        """Fresh samples of every seen condition, of which a share has its part."""
         rng = np.random.default_rng((self.seed, 1, step))
-        points = np.stack([self.toy.sample(rng, i, self.draws) for i in self.toy.seen])
-        return ToyBatch(self.conditions, torch.from_numpy(points.astype(np.float32)))
+        points = np.stack([self.toy.quantiles(i, even(rng, self.draws)) for i in self.toy.seen])
+        return ToyBatch(self.conditions, torch.from_numpy(points[:, share.of(self.draws)].astype(np.float32)))
 
     def loss(self, model: Hcnaf, batch: ToyBatch) -> Tensor:
         """Mean negative log-likelihood, nats."""
         theta = model.hypernet(batch.condition).squeeze(1)
-        return -model.log_prob(theta, batch.points).mean()
+        return -fused.log_prob(model.config.flow, theta, batch.points).mean()
 
     def validate(self, model: Hcnaf) -> dict[str, float]:
         """KL of every seen condition: the unseen ones are no one's to choose by."""
@@ -97,11 +99,12 @@ def evaluate_toy(
         log_q = torch.cat([model.log_prob(theta, part.unsqueeze(0))[0] for part in parts]).double().cpu()
         difference = toy.log_prob(i, x) - log_q.numpy()
         error = float(difference.std(ddof=1)) / samples**0.5
-        out.append(Divergence(_name(toy, i), i in toy.seen, float(difference.mean()), error))
+        out.append(Divergence(name_of(toy, i), i in toy.seen, float(difference.mean()), error))
     return out
 
 
-def _name(toy: Toy, index: int) -> str:
+def name_of(toy: Toy, index: int) -> str:
+    """What a condition is called."""
     if isinstance(toy, ToyOne):
         return f"n = {toy.sides[index]}"
     if isinstance(toy, ToyTwo):

@@ -22,6 +22,9 @@ DIRECTION_CHANNELS = ("direction_x", "direction_y")
 
 Actors = Literal["none", "now", "history"]
 
+HeadKind = Literal["hcnaf", "mixture", "affine", "spline"]
+"""The density a model emits: HCNAF, or a baseline in its place (`hcnaf_models.heads`)."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Crop:
@@ -48,6 +51,7 @@ class ConditionConfig:
     Args:
         hidden: widths of the hidden layers; the last one is the rank of the head. () is linear in the condition.
         location, scale: units of the flow, one number for all dimensions.
+        slope: how steep the first layer's units are to start with, per scale; about H / 6 suits many modes.
         examples: conditions it is meant for, each of `size` numbers. Exports are checked at these and between
             them; far from them an MLP may emit anything.
     """
@@ -58,6 +62,7 @@ class ConditionConfig:
     hidden: tuple[int, ...] = (64,)
     location: float = 0.0
     scale: float = 1.0
+    slope: float = 1.5
     examples: tuple[tuple[float, ...], ...] = ()
     kind: Literal["condition"] = "condition"
 
@@ -80,6 +85,7 @@ class PomConfig:
         reference_size, actors_size, map_size, time_size: widths of the parts' outputs.
         widths: channels of the encoder's stages. trunk: widths of the joint MLP; the last is the heads' rank.
         spread: base scale per dimension, s(t) = a + b t + c t^2 with t in seconds.
+        head: the density emitted.
     """
 
     flow: FlowSpec = field(default_factory=FlowSpec)
@@ -101,6 +107,7 @@ class PomConfig:
     widths: tuple[int, ...] = (16, 32, 48, 64)
     trunk: tuple[int, ...] = (128, 64)
     spread: tuple[float, float, float] = (0.3, 0.4, 0.3)
+    head: HeadKind = "hcnaf"
     kind: Literal["pom"] = "pom"
 
     def __post_init__(self) -> None:
@@ -110,7 +117,40 @@ class PomConfig:
             raise ValueError("draw_actors needs an encoder: name at least one raster channel")
 
 
-ModelConfig = ConditionConfig | PomConfig
+@dataclass(frozen=True, kw_only=True)
+class HistoryConfig:
+    """A planar density whose hyper-network reads a track of positions and nothing else (pedestrians).
+
+    Args:
+        history: history rows, the last one is now. step: seconds between them.
+        horizon: longest horizon (s); horizons lie in (0, horizon].
+        trunk: widths of the MLP that reads a history once. rank: features per horizon, the heads' rank.
+        dropout: share of features dropped in training, after every layer of the trunk.
+        spread: base scale per dimension, s(t) = a + b t + c t^2 with t in seconds.
+        head: the density emitted.
+    """
+
+    flow: FlowSpec = field(default_factory=FlowSpec)
+    history: int = 8
+    step: float = 0.4
+    horizon: float = 4.8
+    trunk: tuple[int, ...] = (256, 256)
+    rank: int = 64
+    dropout: float = 0.1
+    spread: tuple[float, float, float] = (0.02, 0.15, 0.0)
+    head: HeadKind = "hcnaf"
+    kind: Literal["history"] = "history"
+
+    def __post_init__(self) -> None:
+        if self.flow.dims != 2:
+            raise ValueError(f"positions need a flow of 2 dimensions, found {self.flow.dims}")
+        if self.history < 3 or not 0.0 <= self.dropout < 1.0:
+            raise ValueError(
+                f"history must be at least 3 (found {self.history}), dropout in [0, 1) (found {self.dropout})"
+            )
+
+
+ModelConfig = ConditionConfig | PomConfig | HistoryConfig
 
 
 def to_dict(config: ModelConfig) -> dict[str, Any]:
@@ -120,7 +160,11 @@ def to_dict(config: ModelConfig) -> dict[str, Any]:
 
 def from_dict(data: dict[str, Any]) -> ModelConfig:
     """The configuration that `to_dict` wrote. Raises ValueError for an unknown kind or key."""
-    kinds: dict[str, type[ModelConfig]] = {"condition": ConditionConfig, "pom": PomConfig}
+    kinds: dict[str, type[ModelConfig]] = {
+        "condition": ConditionConfig,
+        "pom": PomConfig,
+        "history": HistoryConfig,
+    }
     kind = data.get("kind")
     if kind not in kinds:
         raise ValueError(f"model kind must be one of {sorted(kinds)}, found {kind!r}")

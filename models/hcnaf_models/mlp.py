@@ -5,8 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from hcnaf_models import flow
 from hcnaf_models.config import ConditionConfig
 from hcnaf_models.emission import Emission, initial_raw
+from hcnaf_models.inverse import inverse
 from hcnaf_models.spec import FlowSpec
 
 LOCATION_BOUND = 6.0
@@ -21,9 +23,9 @@ class Head(nn.Module):
     6 base scales of the anchor, s within a factor e^5 of the base scale.
     """
 
-    def __init__(self, spec: FlowSpec, features: int) -> None:
+    def __init__(self, spec: FlowSpec, features: int, slope: float = 1.5) -> None:
         super().__init__()
-        self.spec = spec
+        self.spec, self.uniforms = spec, spec.dims
         self.emission = Emission(spec)
         self.weights = nn.Linear(features, spec.weights)
         self.units = nn.Linear(features, 2 * spec.dims)
@@ -31,15 +33,28 @@ class Head(nn.Module):
         nn.init.zeros_(self.units.weight)
         nn.init.zeros_(self.units.bias)
         with torch.no_grad():
-            self.weights.bias.copy_(initial_raw(spec))
+            self.weights.bias.copy_(initial_raw(spec, slope=slope))
 
     def forward(self, features: Tensor, anchor: Tensor, spread: Tensor) -> Tensor:
         """theta, with the location `anchor` [..., D] and scale `spread` [..., D] (natural units) to start from."""
-        shift, log_scale = self.units(features).chunk(2, dim=-1)
-        location = anchor + spread * bounded(shift, LOCATION_BOUND)
-        scale = spread * torch.exp(bounded(log_scale, LOG_SCALE_BOUND))
+        location, scale = units_of(self.units(features), anchor, spread)
         theta: Tensor = self.emission(self.weights(features), location, scale)
         return theta
+
+    def log_prob(self, theta: Tensor, x: Tensor) -> Tensor:
+        """log p(x | theta) [..., N] for theta [..., P] and x [..., N, D]: nats per unit of x to the D (eq. 1)."""
+        return flow.log_prob(self.spec, theta, x)
+
+    def sample(self, theta: Tensor, uniform: Tensor) -> Tensor:
+        """Samples [..., N, D] for uniform [..., N, D] in (0, 1)."""
+        return inverse(self.spec, theta, uniform).x
+
+
+def units_of(raw: Tensor, anchor: Tensor, spread: Tensor) -> tuple[Tensor, Tensor]:
+    """Location and scale [..., D] from raw [..., 2 D], bounded around `anchor` and `spread` [..., D]."""
+    shift, log_scale = raw.chunk(2, dim=-1)
+    location = anchor + spread * bounded(shift, LOCATION_BOUND)
+    return location, spread * torch.exp(bounded(log_scale, LOG_SCALE_BOUND))
 
 
 def bounded(v: Tensor, bound: float) -> Tensor:
@@ -54,7 +69,7 @@ class ConditionHyperNet(nn.Module):
         super().__init__()
         self.config = config
         self.body = mlp(config.size, config.hidden)
-        self.head = Head(config.flow, (config.size, *config.hidden)[-1])
+        self.head = Head(config.flow, (config.size, *config.hidden)[-1], config.slope)
 
     def forward(self, condition: Tensor) -> Tensor:
         features = self.body(condition).unsqueeze(-2)

@@ -20,7 +20,8 @@ from torch import Tensor, nn
 from hcnaf_models.config import PomConfig
 from hcnaf_models.encoder import Encoder
 from hcnaf_models.geometry import pose_of, states_to_frame, to_frame
-from hcnaf_models.mlp import Head, mlp
+from hcnaf_models.heads import HeadMaker, make_head
+from hcnaf_models.mlp import mlp
 from hcnaf_models.raster import splat_boxes, turn_directions
 
 POSITION_UNIT = 10.0  # m and m/s per unit of what the networks see
@@ -143,7 +144,7 @@ class PomHyperNet(nn.Module):
     head learns the rest.
     """
 
-    def __init__(self, config: PomConfig) -> None:
+    def __init__(self, config: PomConfig, make: HeadMaker = make_head) -> None:
         super().__init__()
         self.config = config
         self.reference = HistoryEncoder(config.reference_size)
@@ -155,7 +156,7 @@ class PomHyperNet(nn.Module):
         widths += config.actors_size * bool(self.actors) + 12 * bool(self.stops)
         widths += config.map_size * bool(self.scene)
         self.trunk = mlp(widths, config.trunk)
-        self.head = Head(config.flow, config.trunk[-1])
+        self.head = make(config.head, config.flow, config.trunk[-1])
 
     def forward(
         self,

@@ -35,9 +35,11 @@ def crop_raster(raster: Tensor, origin: Tensor, resolution: Tensor, pose: Tensor
     """
     x, y = pixel_centres(crop, pose)
     local = torch.stack([x.expand(crop.rows, -1), y.unsqueeze(-1).expand(-1, crop.columns)], dim=-1)
-    points = from_frame(local, pose[:, None, None, :])  # [B, rows, columns, 2]
+    # From the raster's corner: far from the scene's origin float32 metres are coarse, their differences are not.
+    place = torch.cat([pose[:, :2] - origin, pose[:, 2:]], dim=-1)
+    points = from_frame(local, place[:, None, None, :])  # [B, rows, columns, 2]
     extent = torch.stack([(resolution * raster.shape[-1])[0], (resolution * raster.shape[-2])[0]])
-    unit = 2.0 * (points - origin) / extent - 1.0  # corners of the raster at -1 and +1
+    unit = 2.0 * points / extent - 1.0  # corners of the raster at -1 and +1
     # One tall image for all actors: the raster is read in place, not copied once per actor.
     tall = unit.reshape(1, -1, crop.columns, 2)
     image = grid_sample(raster.unsqueeze(0), tall, mode="bilinear", padding_mode="zeros", align_corners=False)

@@ -4,12 +4,14 @@ The steps are those of `hcnaf_models.inverse`; what is added is a good first gue
 way to spend more only where they are. Per theta, quantiles x(u_1) and y(u_2 | u_1) are tabulated on a lattice that
 is even in log(u / (1 - u)), and a sample starts between the entries. The table takes no search: all that a
 dimension can do happens where a unit of its first layer changes sign, so z is known well from its values at a few
-knots per unit. After a few steps for all, the one sample in eight that is farthest from its target gets more.
+knots per unit; the table in x is polished. After a few steps for all samples, those that are farthest from their
+target get more, and the worst of these, which halve their brackets on a staircase, many more.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -27,7 +29,6 @@ from hcnaf_models.inverse import (
     path_of,
     start,
     target_of,
-    zeta_of,
 )
 from hcnaf_models.normal import erf_fraction, log_interval, log_phi
 from hcnaf_models.quantile import log_odds_parts
@@ -47,11 +48,16 @@ KNOTS = 0.0, -1.5, 1.5
 
 MOST_KNOTS = 100
 
+POLISH = 2
+"""Steps for the table in x. That in y is off between its entries more than at them."""
+
 STEPS = 2, 3
 """For all samples, in x and in y."""
 
-STRAGGLERS = (8, 9)
-"""One in so many samples gets so many more steps."""
+STRAGGLERS = ((8, 3), (32, 4)), ((4, 3), (16, 12))
+"""In x and in y: one in so many samples gets so many more steps, after those before."""
+
+Levels = Sequence[tuple[int, int]]
 
 
 class Tables(NamedTuple):
@@ -61,36 +67,64 @@ class Tables(NamedTuple):
     second: Tensor
 
 
+class Drawn(NamedTuple):
+    """What `planar_inverse` returns."""
+
+    points: Tensor
+    """[B, N, 2]: x."""
+    log_prob: Tensor
+    """[B, N]: log p(x), nats per unit of x squared."""
+    error: Tensor
+    """[B, N]: how far (F_1, F_2) at x is from u, the larger of the two."""
+
+
 class Arrival(NamedTuple):
-    """A dimension at the x - m found: its `inputs_along`, log p(x_d | x_<d), and how far z is from its target."""
+    """A dimension at the x - m found: its `inputs_along`, log p(x_d | x_<d), and how far F_d is from u_d."""
 
     along: list[Tensor]
     log_density: Tensor
     error: Tensor
 
 
-def planar_inverse(spec: FlowSpec, theta: Tensor, uniform: Tensor) -> tuple[Tensor, Tensor]:
-    """Samples x [B, N, 2] and log p(x) [B, N] for u [B, N, 2] in (0, 1) under theta [B, P], D = 2."""
+def planar_inverse(spec: FlowSpec, theta: Tensor, uniform: Tensor) -> Drawn:
+    """Samples for u [B, N, 2] in (0, 1) under theta [B, P], D = 2.
+
+    A sample whose error is not small comes out better when drawn again alone: alone it gets all steps.
+    """
     location, stack = flow.split(spec, theta)
     u = [uniform[..., d].unsqueeze(-2) for d in (0, 1)]  # [B, 1, N] each
-    guesses = _looked_up(_tables(stack), *u)
+    guesses = _looked_up(_tables(spec, stack), *u)
     known: list[list[Tensor]] = [[] for _ in stack]
-    found, terms = [], []
+    arrivals = []
     for d in (0, 1):
         path, place = path_of(stack, d, known), location[:, d, None, None]
         target = target_of(spec, path, u[d])
         state = _stepped(path, target, start(path, guesses[d]), STEPS[d])
-        arrival = _mended(spec, path, target, state, place)
+        x = (_mended(path, target, state, STRAGGLERS[d]) + place) - place  # as it is once m was added
+        arrival = _arrived(spec, path, target, x)
         for inputs, h in zip(known, arrival.along, strict=True):
             inputs.append(h)
-        found.append((arrival.along[0] + place).squeeze(-2))
-        terms.append(arrival.log_density.squeeze(-2))
-    return torch.stack(found, dim=-1), terms[0] + terms[1]
+        arrivals.append(arrival)
+    first, second = arrivals
+    points = [
+        (a.along[0] + m).squeeze(-2) for a, m in zip(arrivals, location[..., None, None].unbind(1), strict=True)
+    ]
+    return Drawn(
+        torch.stack(points, dim=-1),
+        (first.log_density + second.log_density).squeeze(-2),
+        torch.maximum(first.error, second.error).squeeze(-2),
+    )
 
 
-def _tables(stack: list[flow.Layer]) -> Tables:
+def _tables(spec: FlowSpec, stack: list[flow.Layer]) -> Tables:
     path = path_of(stack, 0, [[] for _ in stack])
     first = _tabulated(path, FINER * (FIRST - 1) + 1)  # [B, 1, ..]
+    levels = torch.sigmoid(torch.linspace(-REACH, REACH, FINER * (FIRST - 1) + 1, dtype=first.dtype))
+    target = target_of(spec, path, levels.expand_as(first))
+    state = start(path, first)
+    for _ in range(POLISH):
+        state = newton(path, target, state)
+    first = state.x
     x = first[..., ::FINER]
     B = x.shape[0]
     second = path_of(stack, 1, [[h] for h in inputs_along(path, x)])
@@ -157,22 +191,23 @@ def _stepped(path: Path, target: Target, state: State, steps: int) -> State:
     return State(*carried)
 
 
-def _mended(spec: FlowSpec, path: Path, target: Target, state: State, place: Tensor) -> Arrival:
-    """What is found at `state`, after more steps for the samples that are farthest from their target."""
-    arrival = _arrived(spec, path, target, state.x, place)
-    share, steps = STRAGGLERS
-    worst = torch.topk(arrival.error, state.x.shape[-1] // share + 1, dim=-1).indices
+def _mended(path: Path, target: Target, state: State, levels: Levels, taken: int = 1) -> Tensor:
+    """x - m after more steps for those, one in `taken` being here, that were farthest from their target."""
+    if not levels:
+        return state.x
+    (share, steps), *rest = levels
+    worst = torch.topk(_missed(target, state), state.x.shape[-1] // (share // taken) + 1, dim=-1).indices
     part = Path(path.weights, [_picked(c, worst) for c in path.contexts])
     aim = Target(*(_picked(v, worst) for v in target))
     begun = State(*(_picked(v, worst) for v in state))
-    mended = _arrived(spec, part, aim, _stepped(part, aim, begun, steps).x, place)
-    along = [_replaced(v, worst, by) for v, by in zip(arrival.along, mended.along, strict=True)]
-    return Arrival(along, _replaced(arrival.log_density, worst, mended.log_density), arrival.error)
+    mended = _mended(part, aim, _stepped(part, aim, begun, steps), rest, share)
+    return state.x.scatter(-1, worst, mended)
 
 
-def _replaced(v: Tensor, index: Tensor, by: Tensor) -> Tensor:
-    """v [B, H, N] with the columns [B, 1, K] taken from `by` [B, H, K]."""
-    return v.scatter(-1, index.expand(-1, v.shape[-2], -1), by)
+def _missed(target: Target, state: State) -> Tensor:
+    """How far z was from its target before the last step."""
+    z, wanted = torch.sigmoid(target.zeta + state.residual), torch.sigmoid(target.zeta)
+    return torch.abs(z - wanted) * (target.plus - target.minus)
 
 
 def _picked(v: Tensor, index: Tensor) -> Tensor:
@@ -180,21 +215,20 @@ def _picked(v: Tensor, index: Tensor) -> Tensor:
     return v if v.shape[-1] == 1 else torch.gather(v, -1, index.expand(-1, v.shape[-2], -1))
 
 
-def _arrived(spec: FlowSpec, path: Path, target: Target, x: Tensor, place: Tensor) -> Arrival:
-    """At x - m [B, 1, N] as it is once m = `place` was added; with a tangent that does not cancel far out."""
-    x = (x + place) - place
+def _arrived(spec: FlowSpec, path: Path, target: Target, x: Tensor) -> Arrival:
+    """At x - m [B, 1, N], by a tangent that does not cancel far out."""
     a = path.weights[0] * x + path.contexts[0]
     along, t = [x, torch.tanh(a)], path.weights[0] * _quarter_slope(a)
     for w, c in zip(path.weights[1:-1], path.contexts[1:-1], strict=True):
         a = w @ along[-1] + c
         along, t = [*along, torch.tanh(a)], (w @ t) * _quarter_slope(a)
     z = path.weights[-1] @ along[-1] + path.contexts[-1]
+    wanted = target.minus + (target.plus - target.minus) * torch.sigmoid(target.zeta)
     log_slope = torch.log(torch.clamp(path.weights[-1] @ t, min=1.2e-38)) + spec.layers * math.log(4.0)
-    density = log_phi(z) + log_slope
+    log_base = log_phi(z)  # of the truncated normal, log dF/dz
     if spec.support != "paper":
-        density = density - log_interval(target.minus, target.plus)
-    below, above = z - target.minus, target.plus - z
-    return Arrival(along, density, torch.abs((zeta_of(below, above) - target.zeta) * below * above))
+        log_base = log_base - log_interval(target.minus, target.plus)
+    return Arrival(along, log_base + log_slope, torch.abs(z - wanted) * torch.exp(log_base))
 
 
 def _quarter_slope(a: Tensor) -> Tensor:

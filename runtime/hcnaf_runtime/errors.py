@@ -13,7 +13,8 @@
     └── FailedError       what was asked for was tried and failed (commands exit with 1)
         ├── ParityError       an exported graph does not agree with PyTorch
         ├── VerifyError       a bundle does not reproduce its golden outputs
-        └── TrainingError     training diverged
+        ├── TrainingError     training diverged
+        └── ReproductionError a reproduced figure is worse than its bound
 
 Messages are one line: what was found, what was expected, what to do.
 """
@@ -73,3 +74,7 @@ class VerifyError(FailedError):
 
 class TrainingError(FailedError):
     """Training diverged."""
+
+
+class ReproductionError(FailedError):
+    """A reproduced figure is worse than its bound."""

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hcnaf_export.data.toys import ToyOne, ToyTwo
+from hcnaf_export.data.toys import ToyOne, ToyTwo, even
 
 ALL = [(ToyOne(), i) for i in range(3)] + [(ToyTwo(), i) for i in range(9)]
 
@@ -62,3 +62,29 @@ def test_conditions_tell_seen_from_unseen():
     assert len({tuple(row) for row in two.conditions().tolist()}) == 9
     assert set(np.unique(two.conditions())) == {-1.0, 0.0, 1.0}
     np.testing.assert_array_equal(two.conditions() * 4.0 + 8.0, two.centres())
+
+
+@pytest.mark.parametrize(("toy", "index"), ALL)
+def test_quantiles_of_even_points_have_the_density_s_moments(toy, index):
+    x = toy.quantiles(index, even(np.random.default_rng(index), 10_000))
+    drawn = toy.sample(np.random.default_rng(1), index, 40_000)
+    assert x.shape == (10_000, 2)
+    assert -toy.log_prob(index, x).mean() == pytest.approx(toy.entropy(index), abs=2e-3)  # 0.01 by chance alone
+    np.testing.assert_allclose(x.mean(axis=0), drawn.mean(axis=0), atol=0.1)
+    np.testing.assert_allclose(np.cov(x.T), np.cov(drawn.T), rtol=0.05, atol=0.1)
+
+
+@pytest.mark.parametrize("n", [1, 7, 64, 512])
+def test_even_points_put_one_into_every_nth_of_both_axes(n):
+    u = even(np.random.default_rng(3), n)
+    assert u.shape == (n, 2)
+    assert ((u > 0.0) & (u < 1.0)).all()
+    for axis in u.T:
+        assert sorted(np.floor(axis * n)) == list(range(n))
+
+
+def test_an_even_point_picked_at_random_is_uniform():
+    u = np.stack([even(np.random.default_rng(k), 6)[k % 6] for k in range(4000)])
+    for axis in u.T:
+        share = np.sort(axis) - (np.arange(4000) + 0.5) / 4000
+        assert np.abs(share).max() < 0.03  # Kolmogorov and Smirnov: 0.0307 at one in a thousand

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from hcnaf_export.baselines import ConstantVelocityGaussian
+from hcnaf_export.baselines import ConstantVelocityGaussian, labels
 from hcnaf_export.checkpoint import Checkpoint, load_checkpoint
 from hcnaf_export.data.tracks import Dataset
 from hcnaf_export.evaluation import (
@@ -19,12 +19,14 @@ from hcnaf_export.evaluation import (
     evaluate_checkpoint,
     evaluate_toy_checkpoint,
 )
+from hcnaf_export.evaluation.extra_nats import PROTOCOLS, extra_nats, perturbed, summarise_extra_nats
+from hcnaf_export.evaluation.reliability import GRID
 from hcnaf_export.evaluation.scores import mean_and_error
 from hcnaf_export.recipe import read_recipe
 from hcnaf_models.config import PomConfig
 from hcnaf_models.model import build
 from hcnaf_runtime import Forecaster
-from hcnaf_runtime.errors import CheckpointError, HorizonError
+from hcnaf_runtime.errors import CheckpointError, DataError, HorizonError
 from tests.export import synthetic
 
 
@@ -168,6 +170,101 @@ def test_a_bundle_scores_as_its_checkpoint(pom):
     one = CheckpointPredictor(load_checkpoint(pom.checkpoint)).nll(tracks, windows, HORIZONS)
     other = BundlePredictor(Forecaster(pom.path, threads=1)).nll(tracks, windows, HORIZONS)
     assert np.allclose(one, other, atol=2e-3)
+
+
+def test_a_bundle_transforms_as_its_checkpoint(pom):
+    tracks = synthetic.tracks(7)
+    windows = tracks.windows[::40]
+    one = CheckpointPredictor(load_checkpoint(pom.checkpoint)).pit(tracks, windows, HORIZONS)
+    other = BundlePredictor(Forecaster(pom.path, threads=1)).pit(tracks, windows, HORIZONS)
+    assert np.allclose(one, other, atol=1e-3)
+
+
+def test_a_bundle_maps_as_its_checkpoint(pom):
+    tracks = synthetic.tracks(7)
+    one = CheckpointPredictor(load_checkpoint(pom.checkpoint)).cells(tracks, tracks.windows[:3], HORIZONS, GRID)
+    other = BundlePredictor(Forecaster(pom.path, threads=1)).cells(tracks, tracks.windows[:3], HORIZONS, GRID)
+    assert np.allclose(one[0], other[0], atol=5e-4)
+    assert np.array_equal(one[1], other[1])
+
+
+class Oracle:
+    """Knows where the label would be without noise, and spreads a Gaussian of variance `spread` around it."""
+
+    name = "oracle"
+
+    def __init__(self, clean, spread):
+        self.clean, self.spread = clean, spread
+
+    def nll(self, tracks, windows, horizons):
+        clean = replace(tracks, label=self.clean[len(tracks.label)])
+        error = labels(tracks, windows, horizons) - labels(clean, windows, horizons)
+        return 0.5 * np.square(error).sum(axis=-1) / self.spread + math.log(2.0 * math.pi * self.spread)
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_the_best_forecast_has_as_many_extra_nats_as_label_noise_leaves(protocol):
+    tracks = synthetic.tracks(seed=3, count=150)
+    truth, noise = tracks.truth[:, :2].astype(np.float64), synthetic.NOISE.label
+    for label, spread, floor in (
+        (truth, protocol.sigma**2, 0.0),
+        (tracks.label, protocol.sigma**2 + noise**2, 0.5 * math.log1p((noise / protocol.sigma) ** 2)),
+    ):
+        moved = perturbed(replace(tracks, label=np.asarray(label, np.float32)), protocol)
+        oracle = Oracle({len(truth): truth.astype(np.float32)}, spread)
+        nll = oracle.nll(moved, tracks.windows, HORIZONS)
+        found = summarise_extra_nats(HORIZONS, nll, tracks.windows[:, 0], protocol, noise * (floor > 0.0))
+        assert found.floor == pytest.approx(floor)
+        assert found.mean == pytest.approx(floor, abs=4.0 * found.mean_error)
+        assert found.mean_error < 0.02
+
+
+def test_extra_nats_do_not_depend_on_units():
+    """HCNAF's code divides metres by 50 and has an entropy of -6.372463 per step."""
+    normalised, metres = PROTOCOLS
+    nll = np.array([[2.5, -0.3]])
+    theirs = (nll - 2.0 * math.log(50.0) + 6.372463) / 2.0
+    assert np.allclose(extra_nats(nll, normalised), theirs, atol=1e-6)
+    assert np.allclose(extra_nats(nll, metres), (nll + 6.372463) / 2.0, atol=1e-6)
+
+
+def test_perturbed_labels_are_as_far_away_as_they_should_be():
+    tracks = synthetic.tracks(seed=3, count=60)
+    for protocol in PROTOCOLS:
+        moved = perturbed(tracks, protocol)
+        away = moved.label.astype(float) - tracks.label
+        assert away.std() == pytest.approx(protocol.sigma, rel=0.05)
+        assert np.array_equal(perturbed(tracks, protocol).label, moved.label)
+        assert np.array_equal(moved.observed, tracks.observed)
+
+
+def test_a_network_alone(data, checkpoint):
+    dataset = Dataset(data)
+    predictor = CheckpointPredictor(checkpoint)
+    kept = {"horizons": (1.0,), "calibrated": 0, "samples": 0, "extra": False}
+    both = evaluate(predictor, dataset, "train", **kept)
+    alone = [evaluate(predictor, dataset, "train", network=k, **kept) for k in (0, 1)]
+    assert sum(scores.windows for scores in alone) == both.windows
+    together = sum(scores.windows * scores.rows[0].nll for scores in alone) / both.windows
+    assert together == pytest.approx(both.rows[0].nll)
+    assert (both.network, alone[1].network) == (None, "circles")
+    assert "train, circles" in alone[1].title
+    with pytest.raises(DataError, match="has 2 in train"):
+        evaluate(predictor, dataset, "train", network=2)
+
+
+def test_extra_nats_can_be_left_out(data, checkpoint):
+    scores = evaluate_checkpoint(checkpoint, data, horizons=(1.0,), limit=20, calibrated=0, samples=0, extra=False)
+    assert (scores.extra_nats, scores.pit, scores.hdr_coverage, scores.reliability) == ((), None, None, None)
+    whole = evaluate_checkpoint(checkpoint, data, horizons=(1.0,), limit=20, calibrated=10, samples=5)
+    assert whole.rows == scores.rows
+    assert (whole.pit.windows, whole.hdr_coverage.windows, whole.samples.windows) == (10, 10, 5)
+    assert whole.reliability.windows == 10
+    noisy = [e.mean for e in whole.extra_nats]
+    assert noisy[1] > noisy[0]
+    record = whole.record()
+    assert record["test PIT KS"]["1 s"] == max(whole.pit.rows[0].along.ks, whole.pit.rows[0].across.ks)
+    assert record["test coverage of 95% regions"]["1 s"] == whole.hdr_coverage.rows[-1].covered
 
 
 def test_a_horizon_beyond_the_model_is_refused(checkpoint):

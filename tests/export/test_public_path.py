@@ -21,7 +21,8 @@ NODES = 128  # mid-points per column of the reference
 def walked(request, tmp_path_factory):
     layers, hidden = request.param
     recipe = read_recipe("toy1")
-    model = replace(recipe.model, flow=replace(recipe.model.flow, layers=layers, hidden=hidden))
+    flow = replace(recipe.model.flow, layers=layers, hidden=hidden)
+    model = replace(recipe.model, flow=flow, scale=3.0, slope=1.5)  # the recipe's own are for its number of units
     optimiser = msgspec.structs.replace(
         recipe.optimiser, steps=40, batch=64, learning_rate=3e-4, warm_up=5, validate_every=40
     )

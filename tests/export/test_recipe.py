@@ -1,10 +1,10 @@
 """Recipes: every shipped one reads, every mistake is named."""
 
+from typing import get_args, get_type_hints
+
 import pytest
 
 from hcnaf_export.recipe import (
-    PomRecipe,
-    ToyRecipe,
     from_plain,
     parse_recipe,
     read_recipe,
@@ -25,7 +25,7 @@ def test_the_recipes_of_the_issue_are_shipped():
 def test_a_recipe_survives_toml_and_plain_data(name):
     recipe = read_recipe(name)
     assert recipe.name == name
-    assert isinstance(recipe, PomRecipe if recipe.task == "pom" else ToyRecipe)
+    assert recipe.task in get_args(get_type_hints(type(recipe))["task"])
     assert parse_recipe(to_toml(recipe)) == recipe
     assert from_plain(to_plain(recipe)) == recipe
 

@@ -11,6 +11,7 @@ from hcnaf_export.evaluation import evaluate_toy_checkpoint
 from hcnaf_export.recipe import read_recipe
 from hcnaf_export.training.run import run_training
 from hcnaf_export.training.toy import ToyTask, evaluate_toy, toy_of
+from hcnaf_models.model import build
 from hcnaf_runtime.errors import RecipeError
 
 
@@ -88,3 +89,12 @@ def test_a_model_of_another_condition_is_refused():
     model = msgspec.convert({**msgspec.to_builtins(recipe.model), "size": 2, "examples": []}, type(recipe.model))
     with pytest.raises(RecipeError, match=r"model.size is 2"):
         ToyTask(msgspec.structs.replace(recipe, model=model), torch.device("cpu"))
+
+
+def test_a_recipe_says_how_steep_the_first_layer_starts():
+    config = read_recipe("toy1").model
+    units = config.flow.dims * config.flow.hidden
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        slopes = build(config).hypernet.head.weights.bias[:units].detach()
+    assert float(slopes.mean()) == pytest.approx(math.log(config.slope), abs=0.1)

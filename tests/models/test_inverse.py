@@ -78,16 +78,23 @@ def test_points_come_back(spec):
 
 @pytest.mark.parametrize("spec", PLANAR, ids=name)
 def test_a_fixed_number_of_steps_is_enough(spec):
-    theta = torch.stack([random_theta(spec, s).float() for s in (1, 2, 3)])
-    u = uniforms(spec, 1200, dtype=torch.float32).expand(3, -1, -1)
+    """For most samples at once, for the others alone; the error that comes with them tells which are which."""
+    theta = torch.stack([random_theta(spec, s).float() for s in (1, 2, 3, 4)])
+    u = uniforms(spec, 1200, dtype=torch.float32).expand(4, -1, -1)
     with torch.no_grad():
-        x, log_prob = planar_inverse(spec, theta, u)
-    for b in range(3):
-        F, limits = distribution(spec, theta[b], x[b])
-        there = reached(spec, u[b], limits)
+        x, log_prob, error = planar_inverse(spec, theta, u)
+        late = error > 5e-6
+        late[:, :8] = True  # some that need none are drawn alone as well
+        b, i = torch.nonzero(late, as_tuple=True)
+        mended = x.clone()
+        mended[b, i] = planar_inverse(spec, theta[b], u[b, i][:, None]).points[:, 0]
+    for k in range(4):
+        F, limits = distribution(spec, theta[k], mended[k])
+        there = reached(spec, u[k], limits)
         # z carries an error of about 1e-6, and F that over the width of a narrow image.
         limit = 1e-5 + 2e-6 / (limits[1] - limits[0]).min()
-        assert np.abs(F - u[b].double().numpy())[there].max() < limit
+        assert np.abs(F - u[k].double().numpy())[there].max() < limit
+    assert float(late.double().mean()) < 0.06
     torch.testing.assert_close(log_prob, flow.log_prob(spec, theta, x), rtol=1e-5, atol=1e-4)
 
 
@@ -137,12 +144,11 @@ def test_quantiles_rise(spec):
 def test_extremes_stay_finite(spec, end, dtype):
     theta = random_theta(spec, 8).to(dtype)
     u = torch.full((3, spec.dims), end, dtype=dtype)
-    found = [inverse(spec, theta, u)]
+    found = list(inverse(spec, theta, u))
     if spec.dims == 2:
-        found.append(planar_inverse(spec, theta[None], u[None]))
-    for x, log_prob in found:
-        assert x.isfinite().all()
-        assert log_prob.isfinite().all()
+        found += planar_inverse(spec, theta[None], u[None])
+    for values in found:
+        assert values.isfinite().all()
 
 
 def test_leading_sizes_broadcast():

@@ -160,7 +160,7 @@ GRAPHS = {
     lp = Sub(log_det, hq)
     log_prob = Sub(lp, c) }}""",
     "inverse": f"""g (float[B,P] theta, float[B,M,2] uniform)
-    => (float[B,M,2] points, float[B,M] log_prob) {{
+    => (float[B,M,2] points, float[B,M] log_prob, float[B,M] error) {{
     {_PARTS}
     two = Constant<value_ints = [2]>()
     halves = Constant<value_ints = [1, 1]>()
@@ -185,7 +185,8 @@ GRAPHS = {
     c = Constant<value = float {{1.8378770664}}>()
     whole = Add(hq, c)
     loss = Add(whole, log_area)
-    log_prob = Neg(loss) }}""",
+    log_prob = Neg(loss)
+    error = Sub(loss, loss) }}""",
 }
 
 HYPERNET = """g (float[N,R,5] past, int64[A] target, int8[C,H,W] raster, float[T] horizons)

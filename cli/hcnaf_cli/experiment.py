@@ -1,0 +1,154 @@
+"""`hcnaf experiment`: comparisons on real recordings, each by one command."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import click
+
+from hcnaf_cli.errors import INTERRUPTED
+from hcnaf_cli.output import ProgressLine, show_json, table, talk, writing
+
+if TYPE_CHECKING:
+    from hcnaf_export.experiments.eth_ucy import Plan
+    from hcnaf_export.training.loop import Progress
+
+_PATH = click.Path(path_type=Path)
+SPLITS = ("eth", "hotel", "univ", "zara1", "zara2")
+MODELS = ("hcnaf", "mixture", "affine", "spline")
+
+
+@click.group()
+def experiment() -> None:
+    """Compare models on recordings: HCNAF with its baselines, or with less to see."""
+
+
+@experiment.command(name="eth-ucy")
+@click.option("--data", type=_PATH, required=True, metavar="DIR", help="Folder of the eight ETH/UCY recordings.")
+@click.option("--out", type=_PATH, required=True, metavar="DIR", help="Folder to write to, or to go on in.")
+@click.option("--splits", metavar="eth,zara1", help="Splits to run [default: all five].")
+@click.option(
+    "--models", metavar="hcnaf,spline", help="Models to run [default: all four], beside constant velocity."
+)
+@click.option("--seeds", type=click.IntRange(min=1), default=1, show_default=True, help="Runs of every model.")
+@click.option("--recipe", default="eth-ucy", show_default=True, metavar="TOML", help="What every cell trains by.")
+@click.option("--minutes", type=click.FloatRange(min=0), default=0.0, help="Longest training of a cell.")
+@click.option("--threads", type=click.IntRange(min=1), help="CPU threads [default: PyTorch's choice].")
+@click.option("--bundles", is_flag=True, help="Also export HCNAF's models and score the bundles.")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON instead of text.")
+def eth_ucy(
+    data: Path,
+    out: Path,
+    splits: str | None,
+    models: str | None,
+    seeds: int,
+    recipe: str,
+    minutes: float,
+    threads: int | None,
+    bundles: bool,
+    as_json: bool,
+) -> None:
+    """Pedestrians of ETH/UCY, leave one scene out: exact NLL and samples of HCNAF and four baselines.
+
+    Trains one model after the other; what is done is not done again, so the same command goes on where it stopped.
+    """
+    from hcnaf_export.experiments.eth_ucy import Plan
+    from hcnaf_export.recipe import TrackRecipe, read_recipe
+
+    plan_recipe = read_recipe(recipe)
+    if not isinstance(plan_recipe, TrackRecipe):
+        raise click.UsageError(f"--recipe {recipe} is for {plan_recipe.task}, give one whose task is eth-ucy")
+    plan = Plan(
+        data=data,
+        out=out,
+        splits=_chosen(splits, SPLITS, "--splits"),
+        models=_chosen(models, MODELS, "--models"),
+        seeds=tuple(range(seeds)),
+        recipe=plan_recipe,
+        minutes=minutes,
+        threads=threads,
+    )
+    _run(plan, bundles)
+    _show(plan, as_json)
+
+
+@experiment.command(name="precog")
+@click.option("--data", type=_PATH, required=True, metavar="DIR", help="Folder of PRECOG-CARLA episodes.")
+@click.option("--run", type=_PATH, required=True, metavar="RUN", help="Run directory of the model.")
+@click.option(
+    "--twin", type=_PATH, required=True, metavar="RUN", help="Run directory of its twin, such as no-lidar."
+)
+@click.option("--split", type=click.Choice(["train", "val", "test"]), default="test", show_default=True)
+@click.option("--device", default="cpu", show_default=True, metavar="cpu|cuda|cuda:N")
+@click.option("--threads", type=click.IntRange(min=1), help="CPU threads [default: PyTorch's choice].")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON instead of text.")
+def precog(
+    data: Path,
+    run: Path,
+    twin: Path,
+    split: Literal["train", "val", "test"],
+    device: str,
+    threads: int | None,
+    as_json: bool,
+) -> None:
+    """Two trained models of PRECOG-CARLA's player on the same episodes: scores and paired differences."""
+    import torch
+
+    from hcnaf_cli.scores_text import scores_text
+    from hcnaf_export.experiments.precog import compare
+
+    if threads:
+        torch.set_num_threads(threads)
+    with ProgressLine() as line:
+        found = compare(run, twin, data, split, device=device, report=lambda share: line(f"{share:4.0%}"))
+    if as_json:
+        show_json(found.as_dict())
+        return
+    rows = [[d.measure, f"{d.mean:.4f} ± {d.mean_error:.4f}"] for d in found.differences]
+    click.echo(f"{run}: {scores_text(found.model)}\n\n{twin}: {scores_text(found.twin)}\n")
+    click.echo(table(["twin minus model, mean", "paired difference"], rows))
+
+
+def _run(plan: Plan, bundles: bool) -> None:
+    from hcnaf_cli.train import progress_text
+    from hcnaf_export.experiments.eth_ucy import cells, run_cell
+    from hcnaf_export.experiments.eth_ucy_bundle import run_bundle
+
+    grid = cells(plan)
+    with ProgressLine() as line:
+        for number, (split, model, seed) in enumerate(grid, 1):
+
+            def report(progress: Progress, where: str = f"{number}/{len(grid)} {split} {model} {seed}") -> None:
+                line(f"{where}: {progress_text(progress)}")
+
+            if not run_cell(plan, split, model, seed, report):
+                talk("interrupted; the same command goes on")
+                raise click.exceptions.Exit(INTERRUPTED)
+            if bundles and model == "hcnaf":
+                line(f"{split} {model} {seed}: export")
+                run_bundle(plan, split, seed)
+
+
+def _show(plan: Plan, as_json: bool) -> None:
+    from hcnaf_export.experiments.eth_ucy_report import markdown, plot, record_of, tables
+
+    record = record_of(plan)
+    with writing(plan.out):
+        (plan.out / "record.json").write_text(record.as_json(), encoding="utf-8")
+        (plan.out / "README.md").write_text(markdown(record), encoding="utf-8")
+        plot(record, plan.out / "nll.png")
+    if as_json:
+        show_json(record.as_dict())
+        return
+    for caption, (head, *rows) in tables(record).items():
+        click.echo(f"{caption}\n{table((head[0] + ' ', *head[1:]), rows)}\n")
+    talk(f"wrote record.json, README.md and nll.png to {click.format_filename(plan.out)}")
+
+
+def _chosen(text: str | None, known: tuple[str, ...], option: str) -> tuple[Any, ...]:
+    """Names of a comma-separated list, each once and in the order of `known`."""
+    names = set(known) if text is None else {name.strip() for name in text.split(",")}
+    if wrong := sorted(names - set(known)):
+        raise click.UsageError(f"{option} has {wrong[0]!r}, expected some of {', '.join(known)}")
+    return tuple(name for name in known if name in names)
