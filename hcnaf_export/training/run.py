@@ -10,11 +10,10 @@ RUN/
 
 from __future__ import annotations
 
-import contextlib
 import datetime
 import os
 import platform
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -43,6 +42,7 @@ from hcnaf_export.training.precision import check_precision
 from hcnaf_export.training.precog import PrecogTask
 from hcnaf_export.training.prefetch import loaders
 from hcnaf_export.training.state import RunState
+from hcnaf_export.training.threads import threads as torch_threads
 from hcnaf_export.training.toy import ToyTask
 from hcnaf_models.model import Hcnaf
 from hcnaf_runtime._version import __version__
@@ -102,7 +102,7 @@ def run_training(
     """
     place = _device(device)
     check_precision(recipe.optimiser.precision, place)
-    with team(place) as crew, _threads(threads):
+    with team(place) as crew, torch_threads(threads):
         crew.share.of(recipe.optimiser.batch)
         crew.lead(lambda: check_target(out, resume))
         if isinstance(recipe, MnistRecipe):
@@ -212,14 +212,3 @@ def _device(name: str) -> torch.device:
     if device.type == "cuda" and not torch.cuda.is_available():
         raise RecipeError(f"device is {name!r}, but torch sees no CUDA device here; use cpu")
     return device
-
-
-@contextlib.contextmanager
-def _threads(count: int | None) -> Iterator[None]:
-    before = torch.get_num_threads()
-    if count is not None:
-        torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
