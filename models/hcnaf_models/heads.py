@@ -14,6 +14,7 @@ References:
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from typing import Protocol
 
 import torch
@@ -71,7 +72,7 @@ def make_head(kind: HeadKind, spec: FlowSpec, features: int) -> nn.Module:
     )
 
 
-class UnitsHead(nn.Module):
+class UnitsHead(nn.Module, ABC):
     """Location and scale in front of theta; the rest is the subclass's."""
 
     def __init__(self, features: int) -> None:
@@ -96,17 +97,17 @@ class UnitsHead(nn.Module):
         location, scale, rest = torch.split(theta, [2, 2, theta.shape[-1] - 4], dim=-1)
         return location.unsqueeze(-2) + scale.unsqueeze(-2) * self.unit_sample(rest, uniform)
 
+    @abstractmethod
     def emit(self, features: Tensor) -> Tensor:
         """What theta holds after location and scale."""
-        raise NotImplementedError
 
+    @abstractmethod
     def unit_log_prob(self, rest: Tensor, u: Tensor) -> Tensor:
         """log p(u) [..., N] for u [..., N, 2]."""
-        raise NotImplementedError
 
+    @abstractmethod
     def unit_sample(self, rest: Tensor, uniform: Tensor) -> Tensor:
         """u [..., N, 2]."""
-        raise NotImplementedError
 
 
 class MixtureHead(UnitsHead):
