@@ -158,12 +158,12 @@ def thetas(spec: FlowSpec, trained: dict[str, Array]) -> dict[str, Array]:
 
 def _random_theta(spec: FlowSpec, generator: torch.Generator, count: int) -> Array:
     """The standard initialisation, shaken, at random places and scales."""
-    raw = torch.stack([initial_raw(spec, generator) for _ in range(count)])
+    plain = replace(spec, weight_norm="none")  # a trained norm's gains are in the trained thetas
+    raw = torch.stack([initial_raw(plain, generator) for _ in range(count)])
     raw = raw + 0.3 * torch.randn(raw.shape, generator=generator)
     location = 10.0 * torch.randn(count, spec.dims, generator=generator)
     scale = torch.exp(torch.randn(count, spec.dims, generator=generator))
     with torch.no_grad():
-        plain = replace(spec, weight_norm="none")  # a trained norm's gains are in the trained thetas
         theta: Array = Emission(plain)(raw, location, scale).numpy()
     return theta
 

@@ -295,9 +295,10 @@ def from_plain(data: dict[str, Any], source: str = "recipe") -> Recipe:
 
 
 def to_plain(recipe: Recipe) -> dict[str, Any]:
-    """Plain dicts, lists, strings and numbers, fit for a checkpoint."""
+    """Plain dicts, lists, strings and numbers, defaults included, fit for a checkpoint."""
     plain: dict[str, Any] = msgspec.to_builtins(recipe)
-    return plain
+    # msgspec leaves out those settings of a dataclass that were never given.
+    return {**plain, "model": dataclasses.asdict(recipe.model)}
 
 
 def to_toml(recipe: Recipe) -> str:

@@ -1,4 +1,4 @@
-"""`hcnaf experiment`: comparisons on real recordings, each by one command."""
+"""`hcnaf experiment`: comparisons on recordings and in simulated traffic, each by one command."""
 
 from __future__ import annotations
 
@@ -12,11 +12,13 @@ from hcnaf_cli.output import ProgressLine, show_json, table, talk, writing
 
 if TYPE_CHECKING:
     from hcnaf_export.experiments.eth_ucy import Plan
+    from hcnaf_export.experiments.occupancy import Plan as OccupancyPlan
     from hcnaf_export.training.loop import Progress
 
 _PATH = click.Path(path_type=Path)
 SPLITS = ("eth", "hotel", "univ", "zara1", "zara2")
 MODELS = ("hcnaf", "mixture", "affine", "spline")
+GRIDS = ("conditions", "heads", "size", "norms")
 
 
 @click.group()
@@ -71,6 +73,55 @@ def eth_ucy(
     )
     _run(plan, bundles)
     _show(plan, as_json)
+
+
+@experiment.command(name="occupancy")
+@click.option("--grid", type=click.Choice(GRIDS), required=True, help="What is compared.")
+@click.option("--data", type=_PATH, required=True, metavar="DIR", help="A data set of hcnaf simulate.")
+@click.option("--out", type=_PATH, required=True, metavar="DIR", help="Folder to write to, or to go on in.")
+@click.option("--cells", metavar="C1,C5", help="Models of the grid to run [default: all].")
+@click.option("--seeds", type=click.IntRange(min=1), default=1, show_default=True, help="Runs of every model.")
+@click.option(
+    "--recipe", default="pom-compare", show_default=True, metavar="TOML", help="What cells are changes to."
+)
+@click.option("--threads", type=click.IntRange(min=1), help="CPU threads [default: PyTorch's choice].")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON instead of text.")
+def occupancy(
+    grid: str,
+    data: Path,
+    out: Path,
+    cells: str | None,
+    seeds: int,
+    recipe: str,
+    threads: int | None,
+    as_json: bool,
+) -> None:
+    """Simulated traffic, one thing changed at a time, scored on networks that no model has seen.
+
+    conditions: what the forecast sees, the paper's C1 to C6. heads: HCNAF and its baselines under C5. size: H and
+    L of the flow against bytes and time. norms: support and weight normalisation.
+
+    Trains one model after the other; what is done is not done again, so the same command goes on where it stopped.
+    Grids share a folder, and the models they have in common.
+    """
+    from hcnaf_export.experiments import occupancy_grids
+    from hcnaf_export.experiments.occupancy import Plan
+    from hcnaf_export.recipe import PomRecipe, read_recipe
+
+    plan_recipe = read_recipe(recipe)
+    if not isinstance(plan_recipe, PomRecipe):
+        raise click.UsageError(f"--recipe {recipe} is for {plan_recipe.task}, give one whose task is pom")
+    plan = Plan(
+        grid=grid,
+        data=data,
+        out=out,
+        cells=_chosen(cells, tuple(occupancy_grids.GRIDS[grid].cells), "--cells"),
+        seeds=tuple(range(seeds)),
+        recipe=plan_recipe,
+        threads=threads,
+    )
+    _run_occupancy(plan)
+    _show_occupancy(plan, as_json)
 
 
 @experiment.command(name="precog")
@@ -144,6 +195,43 @@ def _show(plan: Plan, as_json: bool) -> None:
     for caption, (head, *rows) in tables(record).items():
         click.echo(f"{caption}\n{table((head[0] + ' ', *head[1:]), rows)}\n")
     talk(f"wrote record.json, README.md and nll.png to {click.format_filename(plan.out)}")
+
+
+def _run_occupancy(plan: OccupancyPlan) -> None:
+    from hcnaf_cli.train import progress_text
+    from hcnaf_export.experiments.occupancy import run_cell, runs
+    from hcnaf_export.experiments.occupancy_bundle import run_bundle
+
+    cells = dict.fromkeys([*runs(plan), *((plan.about.reference, seed) for seed in plan.seeds)])
+    with ProgressLine() as line:
+        for number, (cell, seed) in enumerate(cells, 1):
+
+            def report(progress: Progress, where: str = f"{number}/{len(cells)} {cell} {seed}") -> None:
+                line(f"{where}: {progress_text(progress)}")
+
+            if not run_cell(plan, cell, seed, report):
+                talk("interrupted; the same command goes on")
+                raise click.exceptions.Exit(INTERRUPTED)
+        for cell in plan.about.cells if plan.about.bundles else ():
+            line(f"{cell}: export")
+            run_bundle(plan, cell, plan.seeds[0])
+
+
+def _show_occupancy(plan: OccupancyPlan, as_json: bool) -> None:
+    from hcnaf_export.experiments.occupancy_report import markdown, plot, record_of, tables
+
+    record = record_of(plan)
+    with writing(plan.out):
+        (plan.out / f"{plan.grid}.json").write_text(record.as_json(), encoding="utf-8")
+        (plan.out / f"{plan.grid}.md").write_text(markdown(record), encoding="utf-8")
+        plot(record, plan.out / f"{plan.grid}.png")
+    if as_json:
+        show_json(record.as_dict())
+        return
+    for caption, (head, *rows) in tables(record).items():
+        click.echo(f"{caption}\n{table((head[0] + ' ', *head[1:]), rows)}\n")
+    names = ", ".join(f"{plan.grid}.{kind}" for kind in ("json", "md", "png"))
+    talk(f"wrote {names} to {click.format_filename(plan.out)}")
 
 
 def _chosen(text: str | None, known: tuple[str, ...], option: str) -> tuple[Any, ...]:

@@ -23,6 +23,7 @@ from hcnaf_export.experiments.eth_ucy import (
 )
 from hcnaf_export.experiments.eth_ucy_bundle import FILE as BUNDLE_FILE
 from hcnaf_export.experiments.eth_ucy_bundle import load_bundle
+from hcnaf_export.experiments.tables import markdown_table
 from hcnaf_export.recipe import to_plain
 from hcnaf_export.training.eth_ucy import HORIZONS
 from hcnaf_runtime.measure import machine
@@ -262,7 +263,7 @@ def markdown(record: Record) -> str:
     """README.md of the result: tables, and what they rest on."""
     parts = ["# ETH/UCY pedestrians, leave one scene out", ""]
     for caption, (head, *rows) in tables(record).items():
-        parts += [f"{caption}:", "", _line(head), _line(["---"] * len(head)), *map(_line, rows), ""]
+        parts += [f"{caption}:", "", *markdown_table(head, rows), ""]
     optimiser, tracks = record.recipe["optimiser"], record.recipe["tracks"]
     windows = ", ".join(f"{name} {s.windows} ({s.pedestrians})" for name, s in record.splits.items())
     sampled = max(s.sampled for s in record.splits.values())
@@ -313,10 +314,6 @@ def _band(ax: Any, values: Mapping[str, float], errors: Mapping[str, float], mod
     v, e = np.array(list(values.values())), np.array(list(errors.values()))
     ax.plot(HORIZONS, v, label=LABELS[model], lw=2.0 if model == OURS else 1.2, color=color)
     ax.fill_between(HORIZONS, v - e, v + e, alpha=0.15, color=color, lw=0)
-
-
-def _line(cells: Sequence[str]) -> str:
-    return "| " + " | ".join(cells) + " |"
 
 
 def _mean(cells: Sequence[CellScores], field: str) -> Float:

@@ -1,6 +1,6 @@
 """From the hyper-network's raw numbers to theta, ready to multiply.
 
-    raw [..., P - D] --exp on diagonal blocks--> weight normalisation --units--> theta [..., P]
+    raw [..., gains + P - D] --exp on diagonal blocks--> weight normalisation --units--> theta [..., P]
 
 Units: the flow works on u = (x - m) / s with a location m and a scale s per dimension, both emitted. m leads
 theta, s is folded into the first layer (W / s), so theta takes x in natural units and gives densities per
@@ -18,13 +18,17 @@ from torch import Tensor, nn
 from hcnaf_models.flow import Layer, layers
 from hcnaf_models.spec import FlowSpec, lower_pairs
 
+LOG_GAIN_BOUND = 4.0
+"""Gains that depend on the condition lie within a factor e^4 of those that do not."""
+
 
 class Emission(nn.Module):
     """raw, location, scale -> theta.
 
     Args:
         spec: the flow's sizes and weight normalisation. `row` and `frobenius` learn one log-gain per output
-            row or per layer, independent of the condition, initialised log U(0, 1).
+            row or per layer, independent of the condition, initialised log U(0, 1). To these, `row-gain` adds a
+            bounded log-gain per output row that is emitted with the weights.
     """
 
     def __init__(self, spec: FlowSpec) -> None:
@@ -32,26 +36,32 @@ class Emission(nn.Module):
         self.spec = spec
         self.log_gains = nn.ParameterList()
         for k in range(1, spec.layers + 2) if spec.weight_norm != "none" else ():
-            shape = (spec.dims, spec.fan_out(k)) if spec.weight_norm == "row" else ()
+            shape = () if spec.weight_norm == "frobenius" else (spec.dims, spec.fan_out(k))
             self.log_gains.append(nn.Parameter(torch.log(torch.rand(shape).clamp(min=1e-3))))
 
     def forward(self, raw: Tensor, location: Tensor, scale: Tensor) -> Tensor:
-        """theta [..., P] from raw [..., P - D] and location, scale [..., D] in natural units (scale > 0)."""
+        """theta [..., P] from raw [..., spec.raw] and location, scale [..., D] in natural units (scale > 0)."""
+        parts = torch.split(raw, [*self.spec.gains, *self.spec.groups[1:]], dim=-1)
+        gains, groups = parts[: len(self.spec.gains)], parts[len(self.spec.gains) :]
         out = [location]
-        for k, layer in enumerate(layers(self.spec, torch.split(raw, list(self.spec.groups[1:]), dim=-1))):
-            layer = self._normalise(k, layer._replace(diagonal=torch.exp(layer.diagonal)))
+        for k, layer in enumerate(layers(self.spec, groups)):
+            gain = gains[k] if gains else None
+            layer = self._normalise(k, layer._replace(diagonal=torch.exp(layer.diagonal)), gain)
             if k == 0:
                 layer = self._to_natural_units(layer, scale)
             out += [v.reshape(*raw.shape[:-1], -1) for v in layer]
         return torch.cat(out, dim=-1)
 
-    def _normalise(self, k: int, layer: Layer) -> Layer:
+    def _normalise(self, k: int, layer: Layer, emitted: Tensor | None) -> Layer:
         if self.spec.weight_norm == "none":
             return layer
         squares = self._row_squares(layer)  # [..., D, H_out]
         if self.spec.weight_norm == "frobenius":
             squares = squares.sum((-1, -2), keepdim=True).expand_as(squares)
-        gain = torch.exp(self.log_gains[k]) * torch.rsqrt(squares + 1e-24)
+        log_gain = self.log_gains[k]
+        if emitted is not None:
+            log_gain = log_gain + bounded(emitted, LOG_GAIN_BOUND).reshape(squares.shape)
+        gain = torch.exp(log_gain) * torch.rsqrt(squares + 1e-24)
         rows = list(lower_pairs(self.spec.dims)[0])
         return Layer(layer.diagonal * gain.unsqueeze(-1), layer.lower * gain[..., rows, :, None], layer.bias)
 
@@ -74,15 +84,20 @@ class Emission(nn.Module):
         )
 
 
+def bounded(v: Tensor, bound: float) -> Tensor:
+    """A smooth clamp to (-bound, bound), the identity near 0."""
+    return bound * torch.tanh(v / bound)
+
+
 def initial_raw(spec: FlowSpec, generator: torch.Generator | None = None, slope: float = 1.5) -> Tensor:
-    """A standard initialisation of raw [P - D]: the bias of zero-weight heads.
+    """A standard initialisation of raw [spec.raw]: the bias of zero-weight heads.
 
     First-layer units tile u in [-3, 3] with slopes around `slope`, inner rows sum to about 2, last rows to about
     4, so that the flow starts as a smooth map of u onto most of the base's range; coupling blocks start near zero.
     Slopes of H / 6 let units overlap with their neighbours alone: a density with many modes is found much sooner.
     """
     H, D = spec.hidden, spec.dims
-    out: list[Tensor] = []
+    out: list[Tensor] = [torch.zeros(sum(spec.gains))]
     for k in range(1, spec.layers + 2):
         rows, cols = spec.fan_out(k), spec.fan_in(k)
         jitter = 0.3 * torch.randn(D, rows, cols, generator=generator)

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from hcnaf_models import flow
 from hcnaf_models.config import ConditionConfig
-from hcnaf_models.emission import Emission, initial_raw
+from hcnaf_models.emission import Emission, bounded, initial_raw
 from hcnaf_models.inverse import inverse
 from hcnaf_models.spec import FlowSpec
 
@@ -27,7 +27,7 @@ class Head(nn.Module):
         super().__init__()
         self.spec, self.uniforms = spec, spec.dims
         self.emission = Emission(spec)
-        self.weights = nn.Linear(features, spec.weights)
+        self.weights = nn.Linear(features, spec.raw)
         self.units = nn.Linear(features, 2 * spec.dims)
         nn.init.zeros_(self.weights.weight)
         nn.init.zeros_(self.units.weight)
@@ -55,11 +55,6 @@ def units_of(raw: Tensor, anchor: Tensor, spread: Tensor) -> tuple[Tensor, Tenso
     shift, log_scale = raw.chunk(2, dim=-1)
     location = anchor + spread * bounded(shift, LOCATION_BOUND)
     return location, spread * torch.exp(bounded(log_scale, LOG_SCALE_BOUND))
-
-
-def bounded(v: Tensor, bound: float) -> Tensor:
-    """A smooth clamp to (-bound, bound), the identity near 0."""
-    return bound * torch.tanh(v / bound)
 
 
 class ConditionHyperNet(nn.Module):

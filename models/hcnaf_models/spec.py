@@ -16,10 +16,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal
+from typing import Literal, get_args
 
 Support = Literal["normalised", "paper"]
-WeightNorm = Literal["none", "row", "frobenius"]
+WeightNorm = Literal["none", "row", "frobenius", "row-gain"]
+WEIGHT_NORMS = get_args(WeightNorm)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,7 +33,8 @@ class FlowSpec:
         hidden: hidden units H per dimension and layer.
         support: `normalised` divides by the mass that tanh lets the base reach, so that the density
             integrates to one; `paper` does not, for comparison with published numbers.
-        weight_norm: applied to whole rows (`row`), whole layers (`frobenius`) or not at all, after exp.
+        weight_norm: applied to whole rows (`row`), whole layers (`frobenius`) or not at all, after exp. `row-gain`
+            is `row` with a factor per row that depends on the condition, within bounds.
     """
 
     dims: int = 2
@@ -49,8 +51,8 @@ class FlowSpec:
             )
         if self.support not in ("normalised", "paper"):
             raise ValueError(f"support must be normalised or paper, found {self.support!r}")
-        if self.weight_norm not in ("none", "row", "frobenius"):
-            raise ValueError(f"weight_norm must be none, row or frobenius, found {self.weight_norm!r}")
+        if self.weight_norm not in WEIGHT_NORMS:
+            raise ValueError(f"weight_norm must be one of {WEIGHT_NORMS}, found {self.weight_norm!r}")
 
     @property
     def pairs(self) -> int:
@@ -66,6 +68,18 @@ class FlowSpec:
     def weights(self) -> int:
         """Length of theta without the location."""
         return self.parameters - self.dims
+
+    @property
+    def gains(self) -> tuple[int, ...]:
+        """Gains that depend on the condition, one per output row of layers 1 .. L + 1; none but for `row-gain`."""
+        if self.weight_norm != "row-gain":
+            return ()
+        return tuple(self.dims * self.fan_out(k) for k in range(1, self.layers + 2))
+
+    @property
+    def raw(self) -> int:
+        """How many raw numbers a hyper-network emits, beside location and scale: gains, then weights."""
+        return sum(self.gains) + self.weights
 
     @property
     def parameters(self) -> int:

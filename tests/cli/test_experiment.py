@@ -74,3 +74,40 @@ def test_missing_recordings(train, recordings, recipe, tmp_path):
     )
     assert (result.exit_code, len(result.stderr.splitlines())) == (2, 1)
     assert "biwi_eth" in result.stderr
+
+
+def test_grids_are_those_there_are():
+    pytest.importorskip("torch")
+    from hcnaf_cli.experiment import GRIDS
+    from hcnaf_export.experiments import occupancy_grids
+
+    assert tuple(occupancy_grids.GRIDS) == GRIDS
+
+
+def test_an_occupancy_grid_is_run_and_recorded(train, tmp_path):
+    pytest.importorskip("matplotlib")
+    from tests.export import synthetic
+
+    data, out = synthetic.write(tmp_path / "data"), tmp_path / "run"
+    command = ("experiment", "occupancy", "--data", data, "--out", out, "--recipe", "pom-tiny", "--threads", "1")
+    result = train(*command, "--grid", "conditions", "--cells", "C2", "--json")
+    assert result.exit_code == 0, result.output
+    found = json.loads(result.stdout)
+    assert found == json.loads((out / "conditions.json").read_text())
+    assert list(found["cells"]) == ["C2"]
+    assert (out / "cells" / "C1-0" / "scores.npz").is_file(), "the reference is run too"
+    assert (out / "conditions.md").read_text().startswith("# What the forecast sees")
+    assert (out / "conditions.png").is_file()
+    again = train(*command, "--grid", "conditions", "--cells", "C2")
+    assert f"{found['cells']['C2']['nll']['4 s']:.3f}" in again.stdout
+
+
+@pytest.mark.parametrize(("options", "message"), [
+    (("--grid", "colours"), "'colours' is not one of"),
+    (("--grid", "heads", "--cells", "C1"), "--cells has 'C1'"),
+    (("--grid", "heads", "--recipe", "eth-ucy"), "eth-ucy is for eth-ucy"),
+])  # fmt: skip
+def test_bad_usage_of_grids(train, tmp_path, options, message):
+    result = train("experiment", "occupancy", "--data", tmp_path, "--out", tmp_path / "run", *options)
+    assert result.exit_code == 2
+    assert message in result.stderr

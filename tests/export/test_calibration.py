@@ -141,7 +141,7 @@ def test_paths_of_a_checkpoint_are_labels_that_pass(checkpoint, tracks):
         assert abs(row.covered - row.level) < 3.5 * row.error
 
 
-@pytest.mark.parametrize("weight_norm", ["none", "row", "frobenius"])
+@pytest.mark.parametrize("weight_norm", ["none", "row", "frobenius", "row-gain"])
 def test_a_temperature_is_in_the_weights(weight_norm):
     config = PomConfig(flow=FlowSpec(hidden=6, weight_norm=weight_norm), channels=(), draw_actors=False)
     with torch.random.fork_rng(devices=[]):

@@ -84,3 +84,9 @@ def test_an_impossible_setting_is_one_line(text, part):
 def test_a_missing_recipe_lists_the_shipped_ones(tmp_path):
     with pytest.raises(RecipeError, match="pom-sim"):
         read_recipe(tmp_path / "none.toml")
+
+
+def test_a_recipe_is_written_with_the_settings_it_left_out():
+    text = to_toml(parse_recipe(MINIMAL))
+    for setting in ("max_actors = 4", "weight_norm = ", "ahead = 80.0", "draws = 2", "trunk = [128, 64]"):
+        assert setting in text

@@ -10,13 +10,14 @@ import torch
 
 from hcnaf_export.data.tracks import FUTURE, HISTORY, NoiseModel
 from hcnaf_export.recipe import Windows, read_recipe
-from hcnaf_export.training.pom import log_prob
+from hcnaf_export.training.pom import FUSED_FROM, log_prob, loss
 from hcnaf_export.training.sampling import FixedWindows, WindowSampler
 from hcnaf_export.training.windows import Perception, WindowPool
 from hcnaf_models.config import PomConfig
 from hcnaf_models.geometry import from_frame, pose_of
 from hcnaf_models.model import build
 from hcnaf_models.raster import pixel_centres
+from hcnaf_models.spec import FlowSpec
 from hcnaf_runtime.errors import DataError
 from tests.export import synthetic
 
@@ -197,3 +198,18 @@ def test_what_does_not_fit_the_model_is_named(sets):
         WindowPool(sets, dataclasses.replace(CONFIG, step=0.2), 5)
     with pytest.raises(DataError, match="no windows"):
         WindowPool([dataclasses.replace(sets[0], windows=sets[0].windows[:0])], CONFIG, 5)
+
+
+@pytest.mark.parametrize("hidden", [4, FUSED_FROM])
+def test_the_loss_of_wide_flows_has_the_same_value_and_derivative(pool, hidden):
+    config = dataclasses.replace(CONFIG, flow=FlowSpec(hidden=hidden))
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        model = build(config).eval()
+        model.hypernet.head.weights.weight.data.normal_(0.0, 0.05)
+    batch = sampler(pool, batch=4).batch(0)
+    found, expected = loss(model, batch), -log_prob(model, batch).mean()
+    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)
+    weights = model.hypernet.head.weights.weight
+    gradients = [torch.autograd.grad(v, weights)[0] for v in (found, expected)]
+    torch.testing.assert_close(*gradients, rtol=1e-3, atol=1e-5)

@@ -16,6 +16,7 @@ SPECS = [
     FlowSpec(dims=2, layers=3, hidden=100),
     FlowSpec(dims=3, layers=2, hidden=5, support="paper"),
     FlowSpec(dims=5, layers=2, hidden=3, weight_norm="row"),
+    FlowSpec(dims=2, layers=2, hidden=6, weight_norm="row-gain"),
 ]
 
 
@@ -28,6 +29,6 @@ def random_theta(spec: FlowSpec, seed: int, *, roughness: float = 0.5, scale: fl
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         emission = Emission(spec).double()
-        raw = (initial_raw(spec) + roughness * torch.randn(spec.weights)).double()
+        raw = (initial_raw(spec) + roughness * torch.randn(spec.raw)).double()
         location = torch.full((spec.dims,), 1.0, dtype=torch.float64)
         return emission(raw, location, torch.full_like(location, scale)).detach()
