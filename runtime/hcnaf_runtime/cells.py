@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from hcnaf_runtime import pages
 from hcnaf_runtime.columns import Columns
 from hcnaf_runtime.plane import CHUNK, Distribution, Window
 
@@ -55,7 +56,7 @@ def masses(
     cannot tell from nothing. Memory beyond the result is bounded by `chunk`, whatever the size of the window and
     the number of maps. Results do not depend on how many threads there are.
     """
-    mass = np.zeros((len(theta), len(window.y) - 1, len(window.x) - 1), np.float32)
+    mass = pages.zeros((len(theta), len(window.y) - 1, len(window.x) - 1))
     shares = _shares(window, len(theta))
     parts = [
         Columns(flow, theta[maps], strip, mass[maps, :, columns], tolerance, lost_mass * portion, chunk)

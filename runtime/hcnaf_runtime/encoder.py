@@ -101,7 +101,8 @@ class Encoder:
     def _hypernet(self, outputs: list[str], tensors: dict[str, Any]) -> tuple[list[npt.NDArray[Any]], float]:
         session = self._bundle.session("hypernet", self._settings)
         start = time.perf_counter()
-        values = session.run(outputs, {name: tensors[name] for name in session.inputs})
+        # Copies, since they are remembered: onnxruntime's own would stay in its arena and cut up what is free.
+        values = [value.copy() for value in session.run(outputs, {name: tensors[name] for name in session.inputs})]
         seconds = time.perf_counter() - start
         if not all(np.isfinite(value).all() for value in values):
             raise SceneError("the hyper-network gave NaN or infinity for this input; check the size of its values")

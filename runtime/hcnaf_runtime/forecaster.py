@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from hcnaf_runtime import cells, frames, regions, risk, samples
+from hcnaf_runtime import cells, frames, pages, regions, risk, samples
 from hcnaf_runtime.agents import Heading
 from hcnaf_runtime.bundle import Bundle
 from hcnaf_runtime.encoder import Encoder, Horizons, Theta
@@ -323,7 +323,7 @@ class Forecaster:
 
     def _scene_maps(self, theta: Theta, grid: Grid, tolerance: float, lost_mass: float) -> _Filled:
         A, T, _ = theta.values.shape
-        mass = np.zeros((A, T, grid.height, grid.width), np.float32)
+        mass = pages.zeros((A, T, grid.height, grid.width))
         error, lost = np.zeros((A, T)), np.zeros((A, T))
         for a, pose in enumerate(theta.pose):
             strips = list(frames.covering(grid, pose, grid.resolution / 2).strips(max(1, _STRIP // T)))

@@ -18,6 +18,10 @@ Array = npt.NDArray[Any]
 MOST_THREADS = 4
 """More threads than this do not pay for graphs of this size."""
 
+_REGION = 32 << 20
+"""Bytes of the arena's first region: all that two threads need, with room. What is free in one region can be
+joined, in several it cannot; and what is never touched takes no memory."""
+
 
 def default_threads() -> int:
     """The CPUs this process may use, at most MOST_THREADS."""
@@ -99,9 +103,9 @@ def _share_arena(onnxruntime: Any) -> None:
     where = onnxruntime.OrtMemoryInfo(
         "Cpu", onnxruntime.OrtAllocatorType.ORT_ARENA_ALLOCATOR, 0, onnxruntime.OrtMemType.DEFAULT
     )
-    # No limit, regions twice as large each time, and the rest as onnxruntime has it.
+    # No limit, further regions twice as large each time, and the rest as onnxruntime has it.
     how = {"max_mem": 0, "arena_extend_strategy": 0}
-    how |= {"initial_chunk_size_bytes": -1, "max_dead_bytes_per_chunk": -1}
+    how |= {"initial_chunk_size_bytes": _REGION, "max_dead_bytes_per_chunk": -1}
     with suppress(Exception):  # there is one already; onnxruntime's exceptions share no base but Exception
         onnxruntime.create_and_register_allocator(where, onnxruntime.OrtArenaCfg(how))
 

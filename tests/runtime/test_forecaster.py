@@ -137,6 +137,13 @@ def test_remembering_does_not_keep_scenes_alive(bundle):
     assert watch() is None
 
 
+def test_what_is_remembered_is_not_onnxruntimes_memory(bundle):
+    """It would lie in the arena for long, and cut up what is free there."""
+    theta = Forecaster(bundle, threads=1).theta(Scene(**scene_fields()))
+    assert theta.values.flags.owndata
+    assert theta.pose.flags.owndata
+
+
 def test_threads_share_a_forecaster(bundle, scene):
     forecaster = Forecaster(bundle, threads=1)
     expected = forecaster.pom(scene, horizons=[1.0]).mass
