@@ -89,18 +89,22 @@ def conditional_cdf(
 
 def grid_cdf(spec: FlowSpec, theta: Tensor, x: Tensor, y: Tensor, fraction: Fraction = stable_fraction) -> Tensor:
     """F_2(y | x) at every pair of x [B, S] and y [B, E] under theta [B, P]: [B, E, S]."""
+    return _on_grid(spec, theta, x, y, fraction)[:, :-2]
+
+
+def _on_grid(spec: FlowSpec, theta: Tensor, x: Tensor, y: Tensor, fraction: Fraction) -> Tensor:
+    """`grid_cdf` with its limits, [B, E + 2, S]."""
     m_1, m_2, stack = cut(spec, theta)
-    v = y - m_2
-    v = torch.cat([v, *_infinities(v[:, :1])], dim=-1)
+    v = torch.cat([y - m_2, torch.tensor([-FAR, FAR], dtype=y.dtype, device=y.device) - m_2], dim=-1)
     contexts = second_contexts(stack, (x - m_1).unsqueeze(-2))
     # W_22 v + c as one product with two terms: (v, 1) times (W_22 repeated along s, c), rows of H S numbers.
     first = torch.stack([stack[0].W_22.expand_as(contexts[0]), contexts[0]], dim=1)
-    a = torch.stack([v, torch.ones_like(v)], dim=-1) @ first.flatten(2)
+    a = torch.nn.functional.pad(v.unsqueeze(-1), (0, 1), value=1.0) @ first.flatten(2)
     h = torch.tanh(torch.unflatten(a, -1, contexts[0].shape[1:]))  # [B, E + 2, H, S]
     for layer, c in zip(stack[1:-1], contexts[1:-1], strict=True):
         h = torch.tanh(layer.W_22.unsqueeze(1) @ h + c.unsqueeze(1))
     z = (stack[-1].W_22.unsqueeze(1) @ h).squeeze(2) + contexts[-1]
-    return _distribution(spec, z, fraction)
+    return cdf(z) if spec.support == "paper" else fraction(z)
 
 
 def cell_mass(
@@ -122,14 +126,14 @@ def cell_mass(
         y: [B, E], cell edges, ascending (m).
         fraction: how F_2 follows from z_2 and its limits.
     """
-    F = grid_cdf(spec, theta, x, y, fraction)
-    increments = torch.clamp(F[:, 1:] - F[:, :-1], min=0.0)  # [B, E - 1, S]
+    F = _on_grid(spec, theta, x, y, fraction)
+    increments = torch.clamp(F[:, 1:-2] - F[:, :-3], min=0.0)  # [B, E - 1, S]
     mass, off = increments @ weight, increments @ doubt
     positive = torch.clamp(mass, min=0.0)
     total, kept = mass.sum(1, keepdim=True), positive.sum(1, keepdim=True)
     # Where weights of both signs made cells negative the others give way: columns keep their mass.
     cells = positive * (torch.clamp(total, min=0.0) / torch.clamp(kept, min=1e-30))
-    return Cells(cells, torch.maximum(off.abs().amax(1), (kept - total).squeeze(1)), F)
+    return Cells(cells, torch.maximum(off.abs().amax(1), (kept - total).squeeze(1)), F[:, :-2])
 
 
 def cut(spec: FlowSpec, theta: Tensor) -> tuple[Tensor, Tensor, list[PlanarLayer]]:

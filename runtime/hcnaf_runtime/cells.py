@@ -22,6 +22,7 @@ from hcnaf_runtime.plane import CHUNK, Distribution, Window
 
 Float32 = npt.NDArray[np.float32]
 Float64 = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.intp]
 
 SHARE, SHARES = 128, 8
 """Maps are shared out to threads by so many, in two shares at least and in this many at most."""
@@ -56,10 +57,10 @@ def masses(
     cannot tell from nothing. Memory beyond the result is bounded by `chunk`, whatever the size of the window and
     the number of maps. Results do not depend on how many threads there are.
     """
-    mass = pages.zeros((len(theta), len(window.y) - 1, len(window.x) - 1))
+    mass = pages.empty((len(theta), len(window.y) - 1, len(window.x) - 1))  # each share clears its own
     shares = _shares(window, len(theta))
     parts = [
-        Columns(flow, theta[maps], strip, mass[maps, :, columns], tolerance, lost_mass * portion, chunk)
+        Columns(flow, theta[maps], strip, mass[..., columns], maps, tolerance, lost_mass * portion, chunk)
         for maps, strip, columns, portion in shares
     ]
     flow.each(Columns.run, parts)
@@ -71,12 +72,16 @@ def masses(
     return Cells(mass, inside, error, lost)
 
 
-def _shares(window: Window, maps: int) -> list[tuple[slice, Window, slice, float]]:
-    """What is computed side by side, whatever the number of threads: every so many-th map, or either half of one;
-    with the window, its columns and the portion of the mass that it may lose."""
-    C = len(window.x) - 1
+def _shares(window: Window, maps: int) -> list[tuple[Indices, Window, slice, float]]:
+    """What is computed side by side, whatever the number of threads: maps dealt out to and fro, or either half of
+    one; with the window, its columns and the portion of the mass that it may lose.
+
+    The further ahead a map is the more there is to do: dealt out in turn, one share would get the later horizons.
+    """
+    C, index = len(window.x) - 1, np.arange(maps)
     if maps == 1 and C > 1:
         cuts = (slice(0, C // 2), slice(C // 2, C))
-        return [(slice(0, 1), Window(window.x[cut.start : cut.stop + 1], window.y), cut, 0.5) for cut in cuts]
+        return [(index, Window(window.x[cut.start : cut.stop + 1], window.y), cut, 0.5) for cut in cuts]
     count = int(np.clip(-(-maps // SHARE), 2, SHARES))
-    return [(slice(k, None, count), window, slice(0, C), 1.0) for k in range(min(count, maps))]
+    to_and_fro = np.abs((index + count) % (2 * count) - count + 0.5) - 0.5
+    return [(index[to_and_fro == k], window, slice(0, C), 1.0) for k in range(min(count, maps))]

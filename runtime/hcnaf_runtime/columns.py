@@ -56,6 +56,7 @@ class Columns:
         theta: Float32,
         window: Window,
         mass: Float32,
+        maps: Indices,
         tolerance: float,
         lost_mass: float,
         chunk: int,
@@ -64,7 +65,7 @@ class Columns:
         self.tolerance, self.lost_mass = tolerance, lost_mass
         # Either end of a tile's columns may lose a quarter, the columns left out a half: together lost_mass.
         ends = max(lost_mass / 4.0, SATURATED[0]), max(lost_mass / 4.0, SATURATED[1])
-        self.canvas = Canvas(flow, theta, window, mass, ends, chunk)
+        self.canvas = Canvas(flow, theta, window, mass, maps, ends, chunk)
 
     def run(self) -> None:
         """Fill the maps."""
@@ -85,7 +86,9 @@ class Columns:
                 pending &= (self.error < 0.9 * before) | (self.error >= self.share)
 
     def _begin(self) -> None:
-        """What F_1 tells: the columns' shares, and which of them to keep."""
+        """Empty maps, and what F_1 tells: the columns' shares, and which of them to keep."""
+        for k in self.canvas.maps:
+            self.canvas.mass[k] = 0.0
         edges = np.broadcast_to(self.window.x, (len(self.theta), len(self.window.x)))
         self.cdf = self.flow.marginal_cdf(self.theta, edges).astype(np.float64)
         self.share = np.maximum(np.diff(self.cdf, axis=1), 0.0)
@@ -103,28 +106,20 @@ class Columns:
         pitch = (float(self.window.x[-1]) - left) / (len(self.window.x) - 1)
         weights, misfit = self._weights(tile, HALO.rule)
         first = tile.columns[:, :1] - reach + np.arange(w + 2 * reach)
-        weight = np.zeros((2, len(tile), w + 2 * reach, w), np.float32)
-        column = np.arange(w)
-        for k in range(2 * reach + 1):
-            weight[0, :, column + k, column] = (weights @ HALO.spread[:, k]).T
-            weight[1, :, column + k, column] = (weights @ HALO.doubt[:, k]).T
         x = (left + (first + 0.5) * pitch).astype(np.float32)
-        nodes = Nodes(x, weight[0], weight[1], tile.count + 2 * reach)
+        bands = np.stack([weights @ HALO.spread, weights @ HALO.doubt]).astype(np.float32)
+        nodes = Nodes(x, bands, step=1)
         self._note(tile, self._rows(tile, nodes).fill(), misfit)
 
     def _refine(self, rule: Rule, tile: Tiles) -> None:
         """Several nodes in each column."""
-        J, w = tile.columns.shape
+        J = len(tile)
         weights, misfit = self._weights(tile, rule)
         x = self._places(tile, rule.support[rule.nodes]).reshape(J, -1)
-        weight = np.zeros((2, J, w, rule.size, w), np.float32)
-        column = np.arange(w)
-        weight[0, :, column, :, column] = weights.transpose(1, 0, 2)
-        weight[1, :, column, :, column] = (weights @ rule.doubt).transpose(1, 0, 2)
-        flat = weight.reshape(2, J, -1, w)
-        nodes = Nodes(x, flat[0], flat[1], tile.count * rule.size)
+        bands = np.stack([weights, weights @ rule.doubt]).astype(np.float32)
+        nodes = Nodes(x, bands, step=rule.size)
         low, high = self._held(tile)
-        self.canvas.mass[tile.maps[:, None], :, tile.columns] = 0.0
+        self.canvas.mass[self.canvas.maps[tile.maps, None], :, tile.columns] = 0.0
         found = self._rows(tile, nodes).fill_rows(low, high, np.arange(J))
         unresolved = misfit > np.maximum(RESOLVED * self._of(self.share, tile), self._of(self.goal, tile))
         self._note(tile, found, np.where(unresolved, np.inf, 0.0))
@@ -134,7 +129,8 @@ class Columns:
 
     def _held(self, tile: Tiles) -> tuple[Indices, Indices]:
         """The rows `low` to `high` [J] that hold anything, by what is there now, and MARGIN more."""
-        below = np.cumsum(self.canvas.mass[tile.maps[:, None], :, tile.columns], axis=-1)  # [J, w, R]
+        mass = self.canvas.mass[self.canvas.maps[tile.maps, None], :, tile.columns]  # [J, w, R]
+        below = np.cumsum(mass, axis=-1)
         share = self._of(self.share, tile)[..., None]
         empty = np.count_nonzero(below <= self.canvas.ends[0] * share, axis=-1)
         full = np.count_nonzero(below >= below[..., -1:] - self.canvas.ends[1] * share, axis=-1)

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hcnaf_runtime.plane import Distribution, Window
-from hcnaf_runtime.rows import panels
+from hcnaf_runtime.rows import Panels, panels
 from hcnaf_runtime.tiles import Tiles, batches
 
 Float32 = npt.NDArray[np.float32]
@@ -25,11 +25,16 @@ RESOLVED_TAIL = 1e-6
 SCOUTS = 8
 """Landmarks are looked at from every so many-th node. What that overlooks is found with the cells, and mended."""
 
-COARSE, FINE = 8, 20
-"""Order of the panels of rows that landmarks are at, and of those that rows are interpolated from."""
+COARSE = 8
+"""Order of the panels of rows that landmarks are at."""
 
-TRY = 10.0
-"""Rows are interpolated, and judged then, where landmarks promise an error of less than so many times the goal."""
+ORDERS = {10: 1.0, 12: 10.0, 20: 1.0}
+"""Orders of the panels that rows are interpolated from: the first for which landmarks promise an error of less
+than so many times the goal. As a rule they promise ten times too much, and too little where F_2 is rough."""
+
+WORTH = 2
+"""Rows are interpolated, and judged then, where they are so many times as many as the points or more: where that
+is not good enough they are computed one by one after all."""
 
 LANES = 16
 """Numbers of nodes are alike if they fill as many vectors of this length: a product takes as long for all."""
@@ -40,17 +45,28 @@ WASTE = 1 << 17
 
 @dataclass(frozen=True)
 class Nodes:
-    """Where F_2 is taken for J tiles of w columns, and what it counts for there."""
+    """Where F_2 is taken for J tiles of w columns, and what it counts for there.
 
-    x: Float32  # [J, S]
-    weight: Float32  # [J, S, w]
-    doubt: Float32  # [J, S, w]
-    used: Indices  # [J], how many of the S nodes: the rest is padding
+    Column c of a tile takes the K nodes from c `step` on.
+    """
 
-    def some(self, j: Indices, count: Indices) -> "Nodes":
-        """Those of the tiles j with so many columns [J], with no more padding than they need."""
-        S, w = int(self.used[j].max()), int(count[j].max())
-        return Nodes(self.x[j, :S], self.weight[j, :S, :w], self.doubt[j, :S, :w], self.used[j])
+    x: Float32  # [J, S], S = (w - 1) step + K
+    bands: Float32  # [2, J, w, K]: weights, and their doubts; 0 in padding
+    step: int
+
+    def used(self, count: Indices) -> Indices:
+        """How many of the S nodes tiles with `count` columns take: the rest is padding."""
+        return np.asarray((count - 1) * self.step + self.bands.shape[-1])
+
+    def some(self, j: Indices, w: int) -> tuple[Float32, Float32, Float32]:
+        """Nodes [., S], weights and doubts [., S, w] of the first `w` columns of the tiles j."""
+        K = self.bands.shape[-1]
+        S = (w - 1) * self.step + K
+        dense = np.zeros((2, len(j), S, w), np.float32)
+        size = dense.itemsize
+        along = *dense.strides[:2], (self.step * w + 1) * size, w * size  # as_strided costs 15 microseconds
+        np.ndarray((2, len(j), w, K), np.float32, dense, strides=along)[:] = self.bands[:, j, :w]
+        return self.x[j, :S], dense[0], dense[1]
 
 
 class Found:
@@ -59,21 +75,23 @@ class Found:
     def __init__(self, tile: Tiles) -> None:
         self.error, self.inside, self.outside = np.zeros((3, *tile.columns.shape), np.float32)
 
-    def clear(self, which: Indices) -> None:
-        """Forget the tiles `which`."""
-        for values in (self.error, self.inside, self.outside):
-            values[which] = 0.0
+    def note(self, which: Indices, first: Indices, pieces: Float32) -> None:
+        """Put the three [3, n, w] of the tiles `which`, each from its `first` of n pieces on."""
+        if len(which):
+            self.error[which] = np.maximum.reduceat(pieces[0], first)
+            self.inside[which], self.outside[which] = np.add.reduceat(pieces[1:], first, axis=1)
 
 
 @dataclass(frozen=True)
 class Canvas:
-    """The maps that are filled: theta [B, P], their window, mass [B, R, C] to be written, the share of a column
-    that either end of it may lose, and the most numbers in an intermediate of a graph run."""
+    """The maps that are filled: theta [B, P], their window, mass [., R, C] to be written, which of it is theirs
+    [B], the share of a column that either end of it may lose, and the most numbers in an intermediate of a run."""
 
     flow: Distribution
     theta: Float32
     window: Window
     mass: Float32
+    maps: Indices
     ends: tuple[float, float]
     chunk: int
 
@@ -89,13 +107,16 @@ class TileRows:
 
     def __init__(self, canvas: Canvas, tile: Tiles, nodes: Nodes, share: Float64, goal: Float64) -> None:
         self.canvas, self.tile, self.nodes, self.share, self.goal = canvas, tile, nodes, share, goal
-        self.landmarks, self.panels = panels(canvas.rows, COARSE), panels(canvas.rows, FINE)
+        self.landmarks = panels(canvas.rows, COARSE)
+        self.used = nodes.used(tile.count)
         self.found = Found(tile)
 
     def fill(self) -> Found:
         """Compute the rows where there is anything."""
-        low, high, smooth = self._look()
-        good = self._interpolate(np.flatnonzero(smooth))
+        low, high, order = self._look()
+        good = np.zeros(len(self.tile), np.bool_)
+        for each in np.unique(order[order > 0]).tolist():
+            good |= self._interpolate(np.flatnonzero(order == each), panels(self.canvas.rows, each))
         return self.fill_rows(low, high, np.flatnonzero(~good))
 
     def fill_rows(self, low: Indices, high: Indices, which: Indices) -> Found:
@@ -109,64 +130,79 @@ class TileRows:
             self._evaluate(low, high, again)
         return self.found
 
-    def _look(self) -> tuple[Indices, Indices, Mask]:
-        """From every SCOUTS-th node: rows `low` to `high` [J] outside which there should be nothing, and whether
-        F_2 looks so smooth [J] that rows can be interpolated."""
-        tile, nodes, points = self.tile, self.nodes, self.landmarks.points
-        scouts = np.append(np.arange(0, nodes.x.shape[1] - 1, SCOUTS), nodes.x.shape[1] - 1)
-        cdf = self._at_landmarks(nodes.x[:, scouts])
-        unused = (nodes.weight[:, scouts] == 0.0).all(axis=-1)[:, None]  # padding decides nothing
+    def _look(self) -> tuple[Indices, Indices, Indices]:
+        """From every SCOUTS-th node: rows `low` to `high` [J] outside which there should be nothing, and the order
+        of the panels that rows can be interpolated from [J], 0 for none."""
+        points, last = self.landmarks.points, self.nodes.x.shape[1] - 1
+        scouts = np.append(np.arange(0, last, SCOUTS), last)
+        cdf = self._at_landmarks(self.nodes.x[:, scouts])
+        unused = (scouts >= self.used[:, None])[:, None]  # padding decides nothing
         below = np.where(unused, 0.0, cdf - cdf[:, :1]).max(axis=2)
         above = np.where(unused, 0.0, cdf[:, -1:] - cdf).max(axis=2)[:, ::-1]
         rows, ends = self.canvas.rows, self.canvas.ends
         low = _reach(points, below, ends[0])
         high = np.maximum(rows - _reach(rows - points[::-1], above, ends[1]), low)
-        if rows < 2 * FINE:
-            return low, high, np.zeros(len(tile), np.bool_)
-        predicted = _fall(*self.landmarks.tails(np.diff(cdf, axis=1)), (FINE - COARSE) // 2)
-        promising = predicted * self.share.max(axis=1) < TRY * self.goal.min(axis=1)
-        return low, high, promising & (high - low > len(self.panels.points))
+        return low, high, self._order(*self.landmarks.tails(np.diff(cdf, axis=1)), high - low)
+
+    def _order(self, before: Float32, after: Float32, height: Indices) -> Indices:
+        """The least of ORDERS [J] that is enough as landmarks tell and pays for so many rows [J]; 0 for none."""
+        order, goal = np.zeros(len(self.tile), np.intp), self.goal.min(axis=1)
+        for each, most in reversed(ORDERS.items()):
+            predicted = _fall(before, after, (each - COARSE) // 2) * self.share.max(axis=1)
+            worth = height >= WORTH * len(panels(self.canvas.rows, each).points)
+            order[(predicted < most * goal) & worth] = each
+        return order
 
     def _at_landmarks(self, x: Float32) -> Float32:
-        """F_2 [J, E, S] at the landmarks given x [J, S]."""
-        y = self.landmarks.places(self.canvas.window.y)
-        cdf = np.empty((len(x), len(y), x.shape[1]), np.float32)
-        for j in self._runs(np.full(len(x), len(y)), np.full(len(x), x.shape[1])):
-            cdf[j] = self.canvas.flow.grid_cdf(self._theta(j), x[j], np.broadcast_to(y, (len(j), len(y))))
+        """F_2 [J, E, S] at the landmarks given x [J, S].
+
+        Tiles of one map are taken together where there are many: with few nodes a run's products take as long as
+        with LANES.
+        """
+        y, n = self.landmarks.places(self.canvas.window.y), x.shape[1]
+        many = len(x) * len(y) * LANES * self.canvas.flow.hidden > self.canvas.chunk
+        owner = self.tile.maps if many else np.arange(len(x))
+        order = np.argsort(owner, kind="stable")
+        _, first, count = np.unique(owner[order], return_index=True, return_counts=True)
+        cdf = np.empty((len(x), len(y), n), np.float32)
+        for some in self._runs(np.full(len(count), len(y)), count * n):
+            rank = np.arange(count[some].max())
+            j = order[first[some, None] + np.minimum(rank, count[some, None] - 1)]  # [., tiles of a map]
+            where = np.broadcast_to(y, (len(some), len(y)))
+            together = self.canvas.flow.grid_cdf(self._theta(j[:, 0]), x[j].reshape(len(some), -1), where)
+            cdf[j] = together.reshape(len(some), len(y), -1, n).swapaxes(1, 2)
         return cdf
 
     def _theta(self, j: Indices) -> Float32:
         return self.canvas.theta[self.tile.maps[j]]
 
-    def _interpolate(self, which: Indices) -> Mask:
-        """All rows of the tiles `which` from a few; for which of all tiles [J] that is good enough."""
-        y = self.panels.places(self.canvas.window.y)
+    def _interpolate(self, which: Indices, between: Panels) -> Mask:
+        """All rows of the tiles `which` from points `between` them; for which tiles [J] that is good enough."""
+        y = between.places(self.canvas.window.y)
         good = np.zeros(len(self.tile), np.bool_)
-        for some in self._runs(np.full(len(which), len(y)), self.nodes.used[which]):
+        for some in self._runs(np.full(len(which), len(y)), self.used[which]):
             j = which[some]
-            between, wrong = self._mass(j, np.tile(y, (len(j), 1)))
-            off = _fall(*self.panels.tails(between), 1)
+            mass, wrong = self._mass(j, np.broadcast_to(y, (len(j), len(y))))
+            off = _fall(*between.tails(mass), 1)
             fine = good[j] = off <= self.goal[j].min(axis=1) / 2.0
             if fine.any():
-                self._spread(j[fine], between[fine], wrong[fine], off[fine])
+                self._spread(j[fine], between.increments(mass[fine]), wrong[fine], off[fine])
         return good
 
-    def _spread(self, j: Indices, between: Float32, wrong: Float32, off: Float64) -> None:
-        """Masses `between` places [., n, w] to all rows, with errors `wrong` [., w] in x and `off` [.] in y."""
-        mass = self.panels.increments(between)
+    def _spread(self, j: Indices, mass: Float32, wrong: Float32, off: Float64) -> None:
+        """Interpolated `mass` [., rows, w] of tiles j, with errors `wrong` [., w] in x and `off` [.] in y."""
+        total, w = column_sums(mass), wrong.shape[1]
         below = -np.minimum(mass.min(axis=(1, 2)), 0.0)
-        total, w = between.sum(axis=1), wrong.shape[1]
         if below.any():  # the other rows give way: columns keep their mass
             np.maximum(mass, 0.0, out=mass)
-            mass *= (total / np.maximum(mass.sum(axis=1), 1e-30))[:, None]
+            mass *= (np.maximum(total, 0.0) / np.maximum(column_sums(mass), 1e-30))[:, None]
         self.found.error[j, :w] = wrong + np.maximum(off, below)[:, None]
         self.found.inside[j, :w] = total
         self._put(j, mass, np.zeros_like(j), np.full_like(j, self.canvas.rows))
 
     def _evaluate(self, low: Indices, high: Indices, which: Indices) -> None:
         """Rows `low` to `high` [J] of the tiles `which`, one by one, and what is outside them."""
-        found, rows = self.found, self.canvas.rows
-        found.clear(which)
+        rows = self.canvas.rows
         tall = max(1, self.canvas.chunk // (self.canvas.flow.hidden * self.nodes.x.shape[1]) - 5)
         pieces = np.maximum(-(-(high - low)[which] // tall), 1)
         owner = np.repeat(which, pieces)
@@ -175,21 +211,23 @@ class TileRows:
         stop = np.minimum(start + tall, high[owner])
         below = np.where(rank == 0, 0, start)
         above = np.where(stop == high[owner], rows, stop)
-        for some in self._runs(stop - start + 3, self.nodes.used[owner]):
+        found = np.zeros((3, len(owner), self.tile.columns.shape[1]), np.float32)
+        for some in self._runs(stop - start + 3, self.used[owner]):
             j, first, last = owner[some], start[some], stop[some]
             middle = np.minimum(first[:, None] + np.arange((last - first).max() + 1), last[:, None])
             edges = np.concatenate([below[some, None], middle, above[some, None]], axis=1)
             mass, wrong = self._mass(j, self.canvas.window.y[edges])
             inner, w = mass[:, 1:-1], wrong.shape[1]
-            np.maximum.at(found.error[:, :w], j, wrong)
-            np.add.at(found.inside[:, :w], j, inner.sum(axis=1))  # pieces of one tile add up
-            np.add.at(found.outside[:, :w], j, mass[:, 0] + mass[:, -1])
+            found[0, some, :w] = wrong
+            found[1, some, :w] = column_sums(inner)
+            found[2, some, :w] = mass[:, 0] + mass[:, -1]
             self._put(j, inner, first, last)
+        self.found.note(which, np.cumsum(pieces) - pieces, found)
 
     def _mass(self, j: Indices, y: Float32) -> tuple[Float32, Float32]:
         """Masses between y [., E] in the tiles j, and their errors: `Distribution.cell_mass`."""
-        own = self.nodes.some(j, self.tile.count)
-        return self.canvas.flow.cell_mass(self._theta(j), own.x, own.weight, own.doubt, y)
+        x, weight, doubt = self.nodes.some(j, int(self.tile.count[j].max()))
+        return self.canvas.flow.cell_mass(self._theta(j), x, weight, doubt, y)
 
     def _runs(self, edges: Indices, nodes: Indices) -> list[Indices]:
         """Groups of items, alike in their numbers of `edges` and `nodes` [n], for a graph run each."""
@@ -204,11 +242,17 @@ class TileRows:
 
     def _put(self, j: Indices, mass: Float32, first: Indices, last: Indices) -> None:
         """Put mass [len(j), rows, w] of the tiles j into the maps' rows `first` to `last`."""
+        own = self.canvas.maps[self.tile.maps]
         for i, (owner, low, high) in enumerate(zip(j.tolist(), first.tolist(), last.tolist(), strict=True)):
             n = self.tile.count[owner]
             columns = self.tile.columns[owner, :n]
             at = slice(columns[0], columns[0] + n) if columns[-1] - columns[0] == n - 1 else columns
-            self.canvas.mass[self.tile.maps[owner]][low:high, at] = mass[i, : high - low, :n]
+            self.canvas.mass[own[owner]][low:high, at] = mass[i, : high - low, :n]
+
+
+def column_sums(mass: Float32) -> Float32:
+    """[J, w] from [J, rows, w]: as a product, several times as fast as a sum."""
+    return np.asarray((np.ones((1, mass.shape[1]), np.float32) @ mass)[:, 0])
 
 
 def _reach(points: Float64, held: Float32, end: float) -> Indices:

@@ -4,10 +4,11 @@ import onnxruntime
 import pytest
 import torch
 
-from hcnaf_export.graphs import graphs
+from hcnaf_export.graphs import graphs, weighed_fraction
 from hcnaf_export.onnx_file import EXAMPLE_SIZES, write_onnx
 from hcnaf_export.parity import compare_graph, contract, run_torch
 from hcnaf_export.probes import SCENES, SceneSetting, flow_cases, scene
+from hcnaf_models import planar
 from hcnaf_models.config import ConditionConfig
 from hcnaf_models.model import build
 from hcnaf_models.spec import FlowSpec
@@ -172,6 +173,14 @@ def test_other_flows_agree_with_pytorch(tmp_path, spec, name):
     rows = compare_graph(graph, tmp_path, list(flow_cases(name, spec, {}).values()))
     assert [r.output for r in rows] == [t.name for t in graph.outputs]
     assert all(r.passed for r in rows), rows
+
+
+def test_cells_are_by_erf_only_where_that_is_accurate_enough():
+    """Limits of z that hold 0.003 of the normal mass: erf tells F_2 to some 2e-5, enough for a column of 0.01."""
+    z = torch.cat([torch.linspace(2.0, 2.05, 40), torch.tensor([2.0, 2.05])])[None, :, None]
+    heavy, light = (weighed_fraction(torch.full((1, 1, 1), share))(z) for share in (1.0, 0.01))
+    torch.testing.assert_close(heavy, planar.stable_fraction(z), atol=1e-7, rtol=0.0)
+    assert 1e-6 < (light - planar.stable_fraction(z.double())).abs().max() < 5e-5
 
 
 def test_examples_are_never_of_size_one_and_tell_sizes_apart():

@@ -7,7 +7,7 @@ import pytest
 
 from hcnaf_runtime import measure, pages
 
-SMALL, LARGE, LARGEST = (3, 5, 7), (5, 600, 701), (11, 600, 701)
+SMALL, LARGE, LARGEST = (3, 5, 7), (5, 600, 701), (21, 600, 701)
 
 
 @pytest.fixture(autouse=True)
