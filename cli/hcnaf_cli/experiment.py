@@ -99,7 +99,7 @@ def occupancy(
     """Simulated traffic, one thing changed at a time, scored on networks that no model has seen.
 
     conditions: what the forecast sees, the paper's C1 to C6. heads: HCNAF and its baselines under C5. size: H and
-    L of the flow against bytes and time. norms: support and weight normalisation.
+    L of the flow against bytes and time. norms: support, units and weight normalisation.
 
     Trains one model after the other; what is done is not done again, so the same command goes on where it stopped.
     Grids share a folder, and the models they have in common.

@@ -54,7 +54,7 @@ class TorchPlane(Distribution):
             work(item)
 
     def _tensor(self, value: Float32) -> Tensor:
-        return torch.from_numpy(np.ascontiguousarray(value)).to(self._device)
+        return torch.from_numpy(np.require(value, requirements=("C", "W"))).to(self._device)
 
 
 def _array(value: Tensor) -> Float32:

@@ -47,6 +47,7 @@ class ExperimentGrid:
 
 
 C5 = Cell("C5: C1 and rasters")
+SHEAR: Changes = {"model.flow.shear": True}
 
 GRIDS: dict[str, ExperimentGrid] = {
     "conditions": ExperimentGrid(
@@ -84,11 +85,12 @@ GRIDS: dict[str, ExperimentGrid] = {
         bundles=True,
     ),
     "norms": ExperimentGrid(
-        "Support and weight normalisation under C5",
+        "Support, units and weight normalisation under C5",
         "C5",
         {
             "C5": Cell("normalised, no weight norm"),
             "paper": Cell("paper support, no weight norm", {"model.flow.support": "paper"}),
+            "shear": Cell("normalised, no weight norm, slanted units", SHEAR),
             "row": Cell("normalised, row norm", {"model.flow.weight_norm": "row"}),
             "frobenius": Cell("normalised, Frobenius norm", {"model.flow.weight_norm": "frobenius"}),
             "row-gain": Cell("normalised, row norm, emitted gains", {"model.flow.weight_norm": "row-gain"}),

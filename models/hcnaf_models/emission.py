@@ -2,9 +2,10 @@
 
     raw [..., gains + P - D] --exp on diagonal blocks--> weight normalisation --units--> theta [..., P]
 
-Units: the flow works on u = (x - m) / s with a location m and a scale s per dimension, both emitted. m leads
-theta, s is folded into the first layer (W / s), so theta takes x in natural units and gives densities per
-natural unit, with no other code having to know.
+Units: the flow works on u = (x - m) / s with a location m and a scale s per dimension, both emitted. With slopes
+k_dr, emitted too, the first layer's W_dd takes u_d - sum_{r<d} k_dr u_r: then a Gaussian with a full covariance
+asks no more of the flow than one without. m leads theta, s and k are folded into the first layer, so theta takes
+x in natural units and gives densities per natural unit, with no other code having to know.
 """
 
 from __future__ import annotations
@@ -39,8 +40,13 @@ class Emission(nn.Module):
             shape = () if spec.weight_norm == "frobenius" else (spec.dims, spec.fan_out(k))
             self.log_gains.append(nn.Parameter(torch.log(torch.rand(shape).clamp(min=1e-3))))
 
-    def forward(self, raw: Tensor, location: Tensor, scale: Tensor) -> Tensor:
-        """theta [..., P] from raw [..., spec.raw] and location, scale [..., D] in natural units (scale > 0)."""
+    def forward(self, raw: Tensor, location: Tensor, scale: Tensor, slope: Tensor | None = None) -> Tensor:
+        """theta [..., P] from raw [..., spec.raw] and units.
+
+        Args:
+            raw: what the head emits. location, scale: [..., D] in natural units, scale > 0.
+            slope: k [..., D (D - 1) / 2] in theta's order of pairs, in scales per scale; None for none.
+        """
         parts = torch.split(raw, [*self.spec.gains, *self.spec.groups[1:]], dim=-1)
         gains, groups = parts[: len(self.spec.gains)], parts[len(self.spec.gains) :]
         out = [location]
@@ -48,7 +54,7 @@ class Emission(nn.Module):
             gain = gains[k] if gains else None
             layer = self._normalise(k, layer._replace(diagonal=torch.exp(layer.diagonal)), gain)
             if k == 0:
-                layer = self._to_natural_units(layer, scale)
+                layer = self._to_natural_units(layer if slope is None else self._slanted(layer, slope), scale)
             out += [v.reshape(*raw.shape[:-1], -1) for v in layer]
         return torch.cat(out, dim=-1)
 
@@ -74,6 +80,11 @@ class Emission(nn.Module):
         none = torch.zeros_like(own[..., 0, :])
         parts = [lower[..., a:b, :].sum(-2) if b > a else none for a, b in pairwise(starts)]
         return own + torch.stack(parts, dim=-2)
+
+    def _slanted(self, layer: Layer, slope: Tensor) -> Layer:
+        """W_dd (v_d - sum k_dr v_r) + sum W_dr v_r = W_dd v_d + sum (W_dr - W_dd k_dr) v_r."""
+        rows = list(lower_pairs(self.spec.dims)[0])
+        return layer._replace(lower=layer.lower - layer.diagonal[..., rows, :, :] * slope[..., None, None])
 
     def _to_natural_units(self, layer: Layer, scale: Tensor) -> Layer:
         """W u = (W / s) (x - m)."""

@@ -13,6 +13,7 @@ from hcnaf_models.spec import FlowSpec
 
 LOCATION_BOUND = 6.0
 LOG_SCALE_BOUND = 5.0
+SLOPE_BOUND = 20.0
 
 
 class Head(nn.Module):
@@ -20,7 +21,7 @@ class Head(nn.Module):
 
     Weights start at zero and the bias at a standard initialisation, so that theta starts independent of the
     condition (Beck et al. 2023; Chang et al. 2020). The emitted location and scale are bounded: m within
-    6 base scales of the anchor, s within a factor e^5 of the base scale.
+    6 base scales of the anchor, s within a factor e^5 of the base scale, slopes within 20 scales per scale.
     """
 
     def __init__(self, spec: FlowSpec, features: int, slope: float = 1.5) -> None:
@@ -28,7 +29,7 @@ class Head(nn.Module):
         self.spec, self.uniforms = spec, spec.dims
         self.emission = Emission(spec)
         self.weights = nn.Linear(features, spec.raw)
-        self.units = nn.Linear(features, 2 * spec.dims)
+        self.units = nn.Linear(features, spec.units)
         nn.init.zeros_(self.weights.weight)
         nn.init.zeros_(self.units.weight)
         nn.init.zeros_(self.units.bias)
@@ -37,8 +38,10 @@ class Head(nn.Module):
 
     def forward(self, features: Tensor, anchor: Tensor, spread: Tensor) -> Tensor:
         """theta, with the location `anchor` [..., D] and scale `spread` [..., D] (natural units) to start from."""
-        location, scale = units_of(self.units(features), anchor, spread)
-        theta: Tensor = self.emission(self.weights(features), location, scale)
+        D, units = self.spec.dims, self.units(features)
+        location, scale = units_of(units[..., : 2 * D], anchor, spread)
+        slope = bounded(units[..., 2 * D :], SLOPE_BOUND) if self.spec.shear else None
+        theta: Tensor = self.emission(self.weights(features), location, scale, slope)
         return theta
 
     def log_prob(self, theta: Tensor, x: Tensor) -> Tensor:

@@ -35,6 +35,8 @@ class FlowSpec:
             integrates to one; `paper` does not, for comparison with published numbers.
         weight_norm: applied to whole rows (`row`), whole layers (`frobenius`) or not at all, after exp. `row-gain`
             is `row` with a factor per row that depends on the condition, within bounds.
+        shear: whether the units that x is taken to before the first layer are slanted: x_2 along the slope that
+            Gaussians with a full covariance have. Folded into theta like the scale.
     """
 
     dims: int = 2
@@ -42,6 +44,7 @@ class FlowSpec:
     hidden: int = 20
     support: Support = "normalised"
     weight_norm: WeightNorm = "none"
+    shear: bool = False
 
     def __post_init__(self) -> None:
         if min(self.dims, self.layers, self.hidden) < 1:
@@ -75,6 +78,11 @@ class FlowSpec:
         if self.weight_norm != "row-gain":
             return ()
         return tuple(self.dims * self.fan_out(k) for k in range(1, self.layers + 2))
+
+    @property
+    def units(self) -> int:
+        """Numbers that say where the flow is: location and scale per dimension, and slopes if there are any."""
+        return 2 * self.dims + self.shear * self.pairs
 
     @property
     def raw(self) -> int:
