@@ -28,7 +28,7 @@ SCOUTS = 8
 COARSE = 8
 """Order of the panels of rows that landmarks are at."""
 
-ORDERS = {10: 1.0, 12: 10.0, 20: 1.0}
+ORDERS = {10: 1.0, 12: 1.0, 20: 10.0}
 """Orders of the panels that rows are interpolated from: the first for which landmarks promise an error of less
 than so many times the goal. As a rule they promise ten times too much, and too little where F_2 is rough."""
 
@@ -115,8 +115,10 @@ class TileRows:
         """Compute the rows where there is anything."""
         low, high, order = self._look()
         good = np.zeros(len(self.tile), np.bool_)
-        for each in np.unique(order[order > 0]).tolist():
-            good |= self._interpolate(np.flatnonzero(order == each), panels(self.canvas.rows, each))
+        for each in ORDERS:  # where an order was not good enough the next may be
+            between = panels(self.canvas.rows, each)
+            willing = (order > 0) & (order <= each) & (high - low >= WORTH * len(between.points))
+            good |= self._interpolate(np.flatnonzero(willing & ~good), between)
         return self.fill_rows(low, high, np.flatnonzero(~good))
 
     def fill_rows(self, low: Indices, high: Indices, which: Indices) -> Found:
