@@ -16,6 +16,7 @@ SPECS = [
     FlowSpec(dims=2, layers=3, hidden=100),
     FlowSpec(dims=3, layers=2, hidden=5, support="paper"),
     FlowSpec(dims=5, layers=2, hidden=3, weight_norm="row"),
+    FlowSpec(dims=2, layers=2, hidden=6, weight_norm="row-gain"),
 ]
 
 
