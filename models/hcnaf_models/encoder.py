@@ -8,6 +8,7 @@ References:
 from __future__ import annotations
 
 from itertools import pairwise
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -30,8 +31,28 @@ class CoordConv(nn.Module):
         y = torch.linspace(-1.0, 1.0, rows, dtype=image.dtype, device=image.device)
         x = torch.linspace(-1.0, 1.0, columns, dtype=image.dtype, device=image.device)
         plane = torch.stack([x.expand(rows, columns), y.unsqueeze(-1).expand(rows, columns)])
-        out: Tensor = self.image(image) + self.place(plane.unsqueeze(0))
+        place = self.place(plane.unsqueeze(0))
+        if self.training:
+            sums: Tensor = _OverBatch.apply(self.image(image), place)  # type: ignore[no-untyped-call]
+            return sums
+        out: Tensor = self.image(image) + place
         return out
+
+
+class _OverBatch(torch.autograd.Function):
+    """images [B, ...] + one image [1, ...], whose gradient, a sum over the batch, is taken as a product: several
+    times as fast as a sum where channels come last."""
+
+    @staticmethod
+    def forward(ctx: Any, images: Tensor, one: Tensor) -> Tensor:
+        return images + one
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor]:
+        (gradient,) = gradients
+        flat = gradient.movedim(1, -1)  # without a copy where channels come last
+        total = flat.new_ones(1, len(flat)) @ flat.reshape(len(flat), -1)
+        return gradient, total.reshape(1, *flat.shape[1:]).movedim(-1, 1)
 
 
 class ResidualBlock(nn.Module):
@@ -64,5 +85,7 @@ class Encoder(nn.Module):
         self.out = nn.Linear(widths[-1] * (rows // factor) * (columns // factor), size)
 
     def forward(self, image: Tensor) -> Tensor:
+        if self.training:  # on a CPU a training step is a third faster with channels last
+            image = image.contiguous(memory_format=torch.channels_last)
         h = self.stages(torch.relu(self.stem_norm(self.stem(image))))
         return torch.relu(self.out(h.flatten(1)))
