@@ -53,6 +53,21 @@ def dense(L: int, H: int, columns: int, rows: int, nodes: float = 1.0) -> Cost:
     )
 
 
+def evaluated(L: int, H: int, points: float, first: float) -> Cost:
+    """The cost of F_2 at so many points and F_1 at `first`, whatever the grid; contexts and limits left out."""
+    path = 2 * H * H * (L - 1)
+    return Cost(
+        gemm=round(path * (points + first)),
+        thin=round((4 * H + L * H + 1) * points + 4 * H * first),
+        per_x=0,
+        tanh=round(H * L * (points + first)),
+        erf=round(points + first),
+        theta=4 * parameters(L, H),
+        activations=round(4 * H * L * (points + first)),
+        result=0,
+    )
+
+
 def parameters(L: int, H: int) -> int:
     """P, the length of theta for two dimensions: locations, three blocks and two biases per layer."""
     sizes = [(H, 1), *[(H, H)] * (L - 1), (1, H)]

@@ -77,7 +77,24 @@ def floors(results: Json) -> str:
             + (["-", "-"] if ours is None else [f"{ours * 1e3:.2f}", f"{ours / least:.2f}"])
         )
     head = ["H (L = 3)", "GEMM Mflop", "all Mflop", "M tanh", "activations MB", "map MB"]
-    return table([*head, "GEMM Gflop/s", "G tanh/s", "floor ms", "dense map ms", "above"], rows)
+    edges = table([*head, "GEMM Gflop/s", "G tanh/s", "floor ms", "dense map ms", "above"], rows)
+    return f"{edges}\n\n{_evaluated(results)}" if "dense" in results else edges
+
+
+def _evaluated(results: Json) -> str:
+    """What the rates imply for the points that are evaluated once rows are interpolated."""
+    tanh, rows = results["rates"]["tanh"], []
+    for name, case in results["dense"].items():
+        H, points = int(name.split()[0].removeprefix("H=")), case.get("evaluations")
+        if points is None:
+            continue
+        gemm = max(results["rates"]["gemm"][str(H)].values())
+        least = cost.floor(cost.evaluated(3, H, points["cells"] + points["landmarks"], points["F_1"]), gemm, tanh)
+        ours = case[f"dense x{case['maps']}"]["median"] / case["maps"]
+        counts = (f"{points[k]:,.0f}" for k in ("cells", "landmarks", "F_1"))
+        rows.append([name, *counts, f"{least * 1e3:.2f}", f"{ours * 1e3:.2f}", f"{ours / least:.2f}"])
+    head = ["dense map", "F_2 for cells", "F_2 at landmarks", "F_1", "floor of these ms", "map ms", "above"]
+    return table(head, rows)
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -18,7 +18,7 @@ from hcnaf_models import flow
 from hcnaf_models.spec import FlowSpec
 from hcnaf_runtime.bench import LOST_MASS
 from hcnaf_runtime.measure import latency, machine
-from tests.benchmarks import libraries, ov, published, rates
+from tests.benchmarks import evaluations, libraries, ov, published, rates
 from tests.benchmarks.density import SPREAD, Density, centres, window
 
 Json = dict[str, Any]
@@ -97,11 +97,13 @@ def _maps(setting: Setting, density: Density, scale: float) -> Json:
         "difference": float(np.abs(sparse.mass - full.mass).sum(axis=(2, 3)).max()),
         "window_mass": float(full.window_mass.min()),
         "occupied": float((full.mass[0, 0] > 1e-8).mean()),
+        "evaluations": evaluations.per_map(dense, MAPS),
     }
 
 
 def measure_published(setting: Setting) -> Json:
-    """PyTorch on the 40,000 centres: log-sum-exp as published and the tangent form, eager and compiled."""
+    """PyTorch on the 40,000 centres: log-sum-exp as published and the tangent form, eager and compiled; and with
+    weights for every point, as the authors' code has them."""
     return {f"H={H}": _pytorch(setting, setting.density(3, H)) for H in HIDDEN}
 
 
@@ -116,7 +118,11 @@ def _pytorch(setting: Setting, density: Density) -> Json:
             with torch.no_grad():
                 # The slow ones take seconds: two calls after the warm-up say enough.
                 found[f"{form}, {mode}"] = setting.time(whole, least=2 if form == "log-sum-exp" else 5)
+    each = partial(published.log_prob_each, density.spec, density.theta)
     with torch.no_grad():
+        found["log-sum-exp, weights per point"] = setting.time(
+            partial(_parts, "log-sum-exp", each, density.spec, x), 1
+        )
         found["agreement"] = _agreement(density, x[::97])
     return found
 

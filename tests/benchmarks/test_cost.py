@@ -26,6 +26,13 @@ def test_formulas_count_layers(L, H):
 
 
 @pytest.mark.parametrize(("L", "H"), [(1, 1), (2, 20), (3, 100)])
+def test_a_map_of_all_edges_costs_what_its_points_do_and_a_little_for_x(L, H):
+    whole, points = cost.dense(L, H, 200, 200), cost.evaluated(L, H, 200 * 201, 401)
+    assert (whole.gemm, whole.thin) == (points.gemm - 2 * H * H * (L - 1) * 401, points.thin - 4 * H * 401)
+    assert whole.tanh - points.tanh == 2 * H * (L - 1) * 200
+
+
+@pytest.mark.parametrize(("L", "H"), [(1, 1), (2, 20), (3, 100)])
 def test_theta_has_the_length_of_the_layout(L, H):
     assert cost.parameters(L, H) == FlowSpec(layers=L, hidden=H).parameters
 

@@ -28,6 +28,12 @@ def test_it_is_the_reference_in_float32(flow):
     torch.testing.assert_close(found.double(), log_prob_published(spec, theta, x), rtol=1e-4, atol=1e-4)
 
 
+def test_weights_for_every_point_change_nothing(flow):
+    spec, theta, x = flow
+    found = published.log_prob_each(spec, theta, x)
+    torch.testing.assert_close(found, published.log_prob(spec, theta, x), rtol=1e-4, atol=1e-4)
+
+
 def test_parts_make_the_whole_and_stay_within_the_limit(flow, monkeypatch):
     spec, theta, x = flow
     monkeypatch.setattr(published, "MOST", 17 * spec.dims * spec.hidden**2)
