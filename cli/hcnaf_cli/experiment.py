@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 _PATH = click.Path(path_type=Path)
 SPLITS = ("eth", "hotel", "univ", "zara1", "zara2")
 MODELS = ("hcnaf", "mixture", "affine", "spline")
-GRIDS = ("conditions", "heads", "size", "norms")
+GRIDS = ("conditions", "heads", "rates", "size", "norms")
 
 
 @click.group()
@@ -98,8 +98,9 @@ def occupancy(
 ) -> None:
     """Simulated traffic, one thing changed at a time, scored on networks that no model has seen.
 
-    conditions: what the forecast sees, the paper's C1 to C6. heads: HCNAF and its baselines under C5. size: H and
-    L of the flow against bytes and time. norms: support, units and weight normalisation.
+    conditions: what the forecast sees, the paper's C1 to C6. heads: HCNAF and its baselines under C5. rates: the
+    learning rate of each of these, under C2. size: H and L of the flow against bytes and time. norms: support,
+    units and weight normalisation.
 
     Trains one model after the other; what is done is not done again, so the same command goes on where it stopped.
     Grids share a folder, and the models they have in common.

@@ -1,7 +1,8 @@
-"""What the occupancy experiment compares: four grids of cells, each a change to one recipe.
+"""What the occupancy experiment compares: grids of cells, each a change to one recipe.
 
 conditions   what the hyper-network sees: the paper's ablation C1-C6
 heads        the density it emits: HCNAF and its baselines under C5
+rates        the learning rate of either, without rasters: what the recipe's own rate rests on
 size         the flow's H and L: score against bytes and time
 norms        the support, and the normalisation of weights
 """
@@ -46,7 +47,16 @@ class ExperimentGrid:
     bundles: bool = False
 
 
+RATES = (3e-3, 6e-3, 12e-3)
+HEADS = {
+    "hcnaf": "HCNAF",
+    "mixture": "mixture of 6 Gaussians",
+    "affine": "affine flow (MAF, 5)",
+    "spline": "spline flow (NSF, 3)",
+}
+
 C5 = Cell("C5: C1 and rasters")
+C2: Changes = {**NO_RASTER, "model.actors": "now"}
 SHEAR: Changes = {"model.flow.shear": True}
 
 GRIDS: dict[str, ExperimentGrid] = {
@@ -55,7 +65,7 @@ GRIDS: dict[str, ExperimentGrid] = {
         "C1",
         {
             "C1": Cell("C1: the agent's history", NO_RASTER),
-            "C2": Cell("C2: C1 and others now", {**NO_RASTER, "model.actors": "now"}),
+            "C2": Cell("C2: C1 and others now", C2),
             "C3": Cell("C3: C1 and others' histories", {**NO_RASTER, **ACTORS}),
             "C4": Cell("C4: C3 and stop lines", {**NO_RASTER, **ACTORS, **STOPS}),
             "C5": C5,
@@ -65,11 +75,18 @@ GRIDS: dict[str, ExperimentGrid] = {
     "heads": ExperimentGrid(
         "HCNAF and its baselines under C5",
         "C5",
+        {"C5": Cell(HEADS["hcnaf"])}
+        | {head: Cell(label, {"model.head": head}) for head, label in HEADS.items() if head != "hcnaf"},
+    ),
+    "rates": ExperimentGrid(
+        "The learning rate of every head under C2",
+        "hcnaf-0.006",
         {
-            "C5": Cell("HCNAF"),
-            "mixture": Cell("mixture of 6 Gaussians", {"model.head": "mixture"}),
-            "affine": Cell("affine flow (MAF, 5)", {"model.head": "affine"}),
-            "spline": Cell("spline flow (NSF, 3)", {"model.head": "spline"}),
+            f"{head}-{rate:g}": Cell(
+                f"{label}, {rate:g}", {**C2, "model.head": head, "optimiser.learning_rate": rate}
+            )
+            for head, label in HEADS.items()
+            for rate in RATES
         },
     ),
     "size": ExperimentGrid(

@@ -28,9 +28,10 @@ SCOUTS = 8
 COARSE = 8
 """Order of the panels of rows that landmarks are at."""
 
-ORDERS = {10: 1.0, 12: 1.0, 20: 10.0}
+ORDERS = {4: 1.0, 10: 1.0, 12: 1.0, 20: 10.0}
 """Orders of the panels that rows are interpolated from: the first for which landmarks promise an error of less
-than so many times the goal. As a rule they promise ten times too much, and too little where F_2 is rough."""
+than so many times the goal. As a rule they promise ten times too much, and too little where F_2 is rough. The least
+is for columns that hold next to nothing."""
 
 WORTH = 2
 """Rows are interpolated, and judged then, where they are so many times as many as the points or more: where that
@@ -150,7 +151,7 @@ class TileRows:
         """The least of ORDERS [J] that is enough as landmarks tell and pays for so many rows [J]; 0 for none."""
         order, goal = np.zeros(len(self.tile), np.intp), self.goal.min(axis=1)
         for each, most in reversed(ORDERS.items()):
-            predicted = _fall(before, after, (each - COARSE) // 2) * self.share.max(axis=1)
+            predicted = np.minimum(_fall(before, after, (each - COARSE) // 2), 1.0) * self.share.max(axis=1)
             worth = height >= WORTH * len(panels(self.canvas.rows, each).points)
             order[(predicted < most * goal) & worth] = each
         return order
@@ -276,6 +277,9 @@ def _reach(points: Float64, held: Float32, end: float) -> Indices:
 
 
 def _fall(before: Float32, after: Float32, steps: int) -> Float64:
-    """What coefficients that fell from `before` to `after` add up to from `steps` further on, if they go on so."""
-    ratio = np.minimum(after / np.maximum(before, 1e-12), 0.99)
+    """What coefficients that fell from `before` to `after` add up to from `steps` further on, if they go on so.
+
+    Steps below 0 go back; how fast they fell there is taken to be at most a hundredth each.
+    """
+    ratio = np.clip(after / np.maximum(before, 1e-12), 1e-2, 0.99)
     return np.asarray(2.0 * after * ratio**steps / (1.0 - ratio), np.float64)
