@@ -1,7 +1,9 @@
 """How far an exported graph may be from PyTorch, output by output, and why.
 
 The error of a value v against PyTorch's v* is |v - v*| / max(1, |v*| / knee): absolute up to |v*| = knee, relative
-beyond. Both sides compute in float32 (24 bits, 6e-8 relative) and sum products in different orders.
+beyond. Where log p is so low that p is 0 in float64 it is |v - v*| / |v*|: hyper-networks answer absurd scenes with
+absurd weights, and there log p is a square of thousands. Both sides compute in float32 (24 bits, 6e-8 relative) and
+sum products in different orders.
 """
 
 from __future__ import annotations
@@ -14,13 +16,18 @@ import numpy.typing as npt
 Array = npt.NDArray[np.floating]
 
 
+NOTHING = -745.0
+"""exp of less is 0 in float64."""
+
+
 @dataclass(frozen=True)
 class Tolerance:
-    """`limit` on the error as defined above, for the `reason` given."""
+    """`limit` on the error as defined above, for the `reason` given; `logarithm` where v is a log-density."""
 
     limit: float
     knee: float
     reason: str
+    logarithm: bool = False
 
     def error(self, found: Array, expected: Array) -> npt.NDArray[np.float64]:
         """The error of every value; infinite where either side is not finite."""
@@ -30,8 +37,10 @@ class Tolerance:
         return np.where(finite, np.abs(a - b) / self.scale(b), np.inf)
 
     def scale(self, expected: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-        """max(1, |v*| / knee)."""
-        return np.maximum(1.0, np.abs(expected) / self.knee)
+        """max(1, |v*| / knee), or |v*| where exp v* is nothing."""
+        size = np.abs(expected)
+        scale = np.maximum(1.0, size / self.knee)
+        return np.where(expected < NOTHING, size, scale) if self.logarithm else scale
 
 
 _PROBABILITY = "a probability; float32 resolves 6e-8 near 1 and z carries a few units in the last place"
@@ -56,7 +65,7 @@ TOLERANCES: dict[tuple[str, str], Tolerance] = {
     ("forecast", "mass"): Tolerance(1e-5, 1.0, _FORECAST),
     ("forecast", "window_mass"): Tolerance(1e-5, 1.0, _FORECAST),
     ("forecast", "pose"): Tolerance(1e-5, 1.0, "gathered, and one atan2"),
-    ("path", "log_prob"): Tolerance(1e-4, 50.0, "nats; the promise made from scene to density"),
+    ("path", "log_prob"): Tolerance(1e-4, 50.0, "nats; the promise made from scene to density", logarithm=True),
 }
 """By graph and output. `path` is the hyper-network followed by the flow, as a forecast uses them."""
 
