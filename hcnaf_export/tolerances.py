@@ -1,9 +1,9 @@
 """How far an exported graph may be from PyTorch, output by output, and why.
 
 The error of a value v against PyTorch's v* is |v - v*| / max(1, |v*| / knee): absolute up to |v*| = knee, relative
-beyond. Where log p is so low that p is 0 in float64 it is |v - v*| / |v*|: hyper-networks answer absurd scenes with
-absurd weights, and there log p is a square of thousands. Both sides compute in float32 (24 bits, 6e-8 relative) and
-sum products in different orders.
+beyond. Where log p is so low that p is 0 in float64 it is |v - v*| / |v*|: hyper-networks answer absurd scenes
+with absurd weights, and there log p is a square of thousands. Both sides compute in float32 (24 bits, 6e-8
+relative) and sum products in different orders.
 """
 
 from __future__ import annotations
