@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from hcnaf_export.data.eth_ucy import Windows, split
 from hcnaf_export.evaluation.spread import mean_and_error
+from hcnaf_export.experiments.cells import band, over_seeds
 from hcnaf_export.experiments.eth_ucy import (
     CONSTANT_VELOCITY,
     CellScores,
@@ -155,22 +156,22 @@ def _exported(plan: Plan, name: str) -> Exported | None:
 def split_score(cells: Cells, test: Windows) -> SplitScore:
     """Scores of all models on one split's windows."""
     cluster = test.scene * 10**6 + test.pedestrian
-    ours = _mean(cells[OURS], "nll") if OURS in cells else None
+    ours = over_seeds(cells[OURS], "nll") if OURS in cells else None
     models = {name: _model_score(found, cluster, ours) for name, found in cells.items()}
     sampled = len(next(iter(cells.values()))[0].sampled)
     return SplitScore(len(test), len(np.unique(cluster)), sampled, models)
 
 
 def _model_score(cells: Sequence[CellScores], cluster: NDArray[np.int64], ours: Float | None) -> ModelScore:
-    nll, noisy = _mean(cells, "nll"), _mean(cells, "noisy")
+    nll, noisy = over_seeds(cells, "nll"), over_seeds(cells, "noisy")
     some = cluster[cells[0].sampled]
     behind = (None, None) if ours is None else _one((nll - ours).mean(axis=1), cluster)
     apart = ({}, {}) if ours is None else tuple(_columns(v) for v in mean_and_error(nll - ours, cluster))
     by_horizon, by_horizon_error = mean_and_error(nll, cluster)
     mean, error = _one(nll.mean(axis=1), cluster)
     noisy_mean, noisy_error = _one(noisy.mean(axis=1), cluster)
-    min_ade, min_ade_error = _one(_mean(cells, "min_ade"), some)
-    min_fde, min_fde_error = _one(_mean(cells, "min_fde"), some)
+    min_ade, min_ade_error = _one(over_seeds(cells, "min_ade"), some)
+    min_fde, min_fde_error = _one(over_seeds(cells, "min_fde"), some)
     return ModelScore(
         nll=mean,
         error=error,
@@ -310,14 +311,8 @@ def plot(record: Record, path: Path) -> None:
 
 
 def _band(ax: Any, values: Mapping[str, float], errors: Mapping[str, float], model: str, color: str) -> None:
-    """A line with its standard error around it."""
-    v, e = np.array(list(values.values())), np.array(list(errors.values()))
-    ax.plot(HORIZONS, v, label=LABELS[model], lw=2.0 if model == OURS else 1.2, color=color)
-    ax.fill_between(HORIZONS, v - e, v + e, alpha=0.15, color=color, lw=0)
-
-
-def _mean(cells: Sequence[CellScores], field: str) -> Float:
-    return np.asarray(np.mean([getattr(c, field) for c in cells], axis=0))
+    width = 2.0 if model == OURS else 1.2
+    band(ax, HORIZONS, list(values.values()), list(errors.values()), label=LABELS[model], color=color, width=width)
 
 
 def _one(values: Float, cluster: NDArray[np.int64]) -> tuple[float, float]:

@@ -20,7 +20,7 @@ NO_RASTER: Changes = {"model.channels": [], "model.draw_actors": False}
 ACTORS: Changes = {"model.actors": "history"}
 STOPS: Changes = {"model.stops": True}
 
-SHORT: Changes = {"optimiser.steps": 2000, "windows.horizons": 4}
+SHORT: Changes = {"optimiser.steps": 1500, "windows.horizons": 4}
 """The budget of flows of many sizes: the largest take ten times as long for a step."""
 
 SIZES = tuple((hidden, layers) for layers in (2, 3) for hidden in (10, 20, 50, 100))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from hcnaf_export.evaluation.evaluate import HORIZONS
 from hcnaf_export.evaluation.spread import mean_and_error
+from hcnaf_export.experiments.cells import band, over_seeds
 from hcnaf_export.experiments.occupancy import (
     CellScores,
     Plan,
@@ -94,7 +95,7 @@ def record_of(plan: Plan) -> GridRecord:
         name: [load_cell(cell_folder(plan.out, name, seed)) for seed in plan.seeds]
         for name in dict.fromkeys((grid.reference, *grid.cells))
     }
-    ours = _mean(found[grid.reference], "nll")
+    ours = over_seeds(found[grid.reference], "nll")
     cells = {
         name: msgspec.structs.replace(
             cell_record(cell.label, found[name], ours, cluster),
@@ -123,7 +124,7 @@ def cell_record(
     label: str, cells: Sequence[CellScores], reference: Float, cluster: NDArray[np.int64]
 ) -> CellRecord:
     """Scores of one cell's seeds on windows of clusters [W]; `reference` [W, 8] is the NLL to hold it against."""
-    nll, lost = _mean(cells, "nll"), _mean(cells, "lost")
+    nll, lost = over_seeds(cells, "nll"), over_seeds(cells, "lost")
     score, error = _columns(nll, cluster)
     behind, behind_error = _columns(nll - reference, cluster)
     return CellRecord(
@@ -220,15 +221,9 @@ def plot(record: GridRecord, path: Path) -> None:
     figure.savefig(path, dpi=110)
 
 
-def _band(ax: Any, values: Mapping[str, float], errors: Mapping[str, float], label: str, color: str) -> None:
-    """A line with its standard error around it."""
-    v, e = (np.array([column[f"{t:g} s"] for t in HORIZONS]) for column in (values, errors))
-    ax.plot(HORIZONS, v, label=label, lw=1.5, color=color)
-    ax.fill_between(HORIZONS, v - e, v + e, alpha=0.15, color=color, lw=0)
-
-
-def _mean(cells: Sequence[CellScores], field: str) -> Float:
-    return np.asarray(np.mean([getattr(c, field) for c in cells], axis=0))
+def _band(ax: Any, values: Column, errors: Column, label: str, color: str) -> None:
+    names = [f"{t:g} s" for t in HORIZONS]
+    band(ax, HORIZONS, [values[n] for n in names], [errors[n] for n in names], label=label, color=color)
 
 
 def _columns(values: Float, cluster: NDArray[np.int64]) -> tuple[Column, Column]:
