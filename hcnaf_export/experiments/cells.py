@@ -23,7 +23,7 @@ def band(
     errors: Sequence[float],
     *,
     label: str,
-    color: str,
+    color: Any,
     width: float = 1.5,
 ) -> None:
     """A line over seconds ahead with its standard error around it."""

@@ -202,26 +202,29 @@ def _budget(record: GridRecord) -> str:
 
 def plot(record: GridRecord, path: Path) -> None:
     """NLL against horizon, and how far each cell is behind the reference (extra `plot`)."""
+    from matplotlib import colormaps
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(10.0, 4.2), layout="constrained")
     left, right = figure.subplots(1, 2)
-    for number, (name, cell) in enumerate(record.cells.items()):
-        _band(left, cell.nll, cell.error, cell.label, f"C{number}")
+    palette = colormaps["tab10" if len(record.cells) <= 10 else "tab20"]
+    colors = {name: palette(number) for number, name in enumerate(record.cells)}
+    for name, cell in record.cells.items():
+        _band(left, cell.nll, cell.error, cell.label, colors[name])
         if name not in (record.reference, CONSTANT_VELOCITY):
-            _band(right, cell.behind, cell.behind_error, cell.label, f"C{number}")
+            _band(right, cell.behind, cell.behind_error, cell.label, colors[name])
     reference = record.cells.get(record.reference)
-    right.axhline(0.0, color="C0" if reference else "k", lw=2.0)
+    right.axhline(0.0, color=colors.get(record.reference, "k"), lw=2.0)
     left.set(xlabel="seconds ahead", ylabel="NLL (nats/m²)", title=record.title)
     right.set(xlabel="seconds ahead", ylabel="NLL minus the reference's (nats/m²)")
-    right.set_title(reference.label if reference else record.reference)
+    right.set_title(f"behind {reference.label if reference else record.reference}")
     for ax in (left, right):
         ax.grid(alpha=0.3)
     left.legend(fontsize=7)
     figure.savefig(path, dpi=110)
 
 
-def _band(ax: Any, values: Column, errors: Column, label: str, color: str) -> None:
+def _band(ax: Any, values: Column, errors: Column, label: str, color: Any) -> None:
     names = [f"{t:g} s" for t in HORIZONS]
     band(ax, HORIZONS, [values[n] for n in names], [errors[n] for n in names], label=label, color=color)
 
