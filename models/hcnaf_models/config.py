@@ -18,7 +18,6 @@ from typing import Any, Literal
 from hcnaf_models.spec import FlowSpec
 
 MAP_CHANNELS = ("drivable", "direction_x", "direction_y", "stop_line", "junction")
-DIRECTION_CHANNELS = ("direction_x", "direction_y")
 
 Actors = Literal["none", "now", "history"]
 
