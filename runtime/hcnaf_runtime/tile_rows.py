@@ -30,8 +30,8 @@ COARSE = 8
 
 ORDERS = {4: 1.0, 10: 1.0, 12: 1.0, 20: 10.0}
 """Orders of the panels that rows are interpolated from: the first for which landmarks promise an error of less
-than so many times the goal. As a rule they promise ten times too much, and too little where F_2 is rough. The least
-is for columns that hold next to nothing."""
+than so many times the goal. As a rule they promise ten times too much, and too little where F_2 is rough. The
+least is for columns that hold next to nothing."""
 
 WORTH = 2
 """Rows are interpolated, and judged then, where they are so many times as many as the points or more: where that

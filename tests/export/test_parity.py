@@ -37,11 +37,13 @@ def test_beyond_the_knee_the_limit_is_relative(value, passed):
     assert row("flow", "log_prob", pair([value + 2e-3], [value]), LIMIT).passed is passed
 
 
-@pytest.mark.parametrize(("value", "passed"), [(-744.0, False), (-746.0, True), (-8e6, True), (8e6, False)])
-def test_where_a_density_is_nothing_its_logarithm_may_differ_by_a_share(value, passed):
+@pytest.mark.parametrize(
+    ("value", "most"), [(-40.0, 1e-4), (40.0, 1e-4), (-60.0, 6e-4), (60.0, 1.2e-4), (-744.0, 7.4e-3), (-8e6, 8e2)]
+)
+def test_the_fainter_a_density_the_more_its_logarithm_may_differ(value, most):
     limit = Tolerance(1e-4, 50.0, "a test", logarithm=True)
-    assert row("path", "log_prob", pair([value * (1.0 + 5e-5)], [value]), limit).passed is passed
-    assert not row("path", "log_prob", pair([value * (1.0 + 2e-4)], [value]), limit).passed
+    assert row("path", "log_prob", pair([value + 0.9 * most], [value]), limit).passed
+    assert not row("path", "log_prob", pair([value + 1.1 * most], [value]), limit).passed
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
