@@ -202,6 +202,7 @@ def _run_occupancy(plan: OccupancyPlan) -> None:
     from hcnaf_cli.train import progress_text
     from hcnaf_export.experiments.occupancy import run_cell, runs
     from hcnaf_export.experiments.occupancy_bundle import run_bundle
+    from hcnaf_runtime.errors import ParityError
 
     cells = dict.fromkeys([*runs(plan), *((plan.about.reference, seed) for seed in plan.seeds)])
     with ProgressLine() as line:
@@ -215,7 +216,10 @@ def _run_occupancy(plan: OccupancyPlan) -> None:
                 raise click.exceptions.Exit(INTERRUPTED)
         for cell in plan.about.cells if plan.about.bundles else ():
             line(f"{cell}: export")
-            run_bundle(plan, cell, plan.seeds[0])
+            try:
+                run_bundle(plan, cell, plan.seeds[0])
+            except ParityError as error:  # its scores count, without bytes and times
+                talk(f"{cell} is not exported: {error}")
 
 
 def _show_occupancy(plan: OccupancyPlan, as_json: bool) -> None:

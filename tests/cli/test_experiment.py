@@ -111,3 +111,24 @@ def test_bad_usage_of_grids(train, tmp_path, options, message):
     result = train("experiment", "occupancy", "--data", tmp_path, "--out", tmp_path / "run", *options)
     assert result.exit_code == 2
     assert message in result.stderr
+
+
+def test_a_cell_whose_export_is_refused_is_told_and_the_others_go_on(monkeypatch, capsys, tmp_path):
+    pytest.importorskip("torch")
+    from hcnaf_cli import experiment
+    from hcnaf_export.experiments import occupancy, occupancy_bundle
+    from hcnaf_runtime.errors import ParityError
+
+    tried = []
+
+    def run_bundle(plan, cell, seed):
+        tried.append(cell)
+        if cell == "H20-L2":
+            raise ParityError("inverse.error is 0.1")
+
+    monkeypatch.setattr(occupancy, "run_cell", lambda *args: True)
+    monkeypatch.setattr(occupancy_bundle, "run_bundle", run_bundle)
+    plan = occupancy.Plan(grid="size", data=tmp_path, out=tmp_path, cells=("H10-L2", "H20-L2", "H50-L2"))
+    experiment._run_occupancy(plan)
+    assert tried == ["H10-L2", "H20-L2", "H50-L2"]
+    assert "H20-L2 is not exported: inverse.error is 0.1" in capsys.readouterr().err
