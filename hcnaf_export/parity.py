@@ -6,7 +6,7 @@ its own theta to its own flow. Sessions are those of the runtime, with its setti
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +17,11 @@ import torch
 from hcnaf_export.graphs import Graph
 from hcnaf_export.probes import Feeds, flow_cases, flow_feeds, forecast_feeds, hypernet_feeds
 from hcnaf_export.tolerances import Tolerance, tolerance
+from hcnaf_models import flow
 from hcnaf_models.model import Hcnaf
+from hcnaf_models.spec import FlowSpec
 from hcnaf_runtime.errors import ParityError
+from hcnaf_runtime.flow import MISSED
 from hcnaf_runtime.manifest import Graph as GraphContract
 from hcnaf_runtime.manifest import ParityRow
 from hcnaf_runtime.session import Session, Settings
@@ -51,6 +54,10 @@ def compare(model: Hcnaf, graphs: Sequence[Graph], folder: Path) -> list[ParityR
     trained = {name: run_torch(by_name["hypernet"], feeds)[0] for name, feeds in scenes.items()}
     rows: list[ParityRow] = []
     for graph in graphs:
+        if graph.name == "inverse":
+            cases = flow_cases(graph.name, model.config.flow, trained)
+            rows += compare_samples(model.config.flow, graph, folder, list(cases.values()))
+            continue
         if graph.name == "forecast":
             cases = forecast_feeds(scenes)
         else:
@@ -68,6 +75,53 @@ def compare_graph(graph: Graph, folder: Path, cases: Sequence[Feeds]) -> list[Pa
     return [
         row(graph.name, name, list(zip(a, b, strict=True)), tolerance(graph.name, name)) for name, a, b in outputs
     ]
+
+
+def compare_samples(spec: FlowSpec, graph: Graph, folder: Path, cases: Sequence[Feeds]) -> list[ParityRow]:
+    """The rows of graph `inverse`, used as its contract says: what comes with a large error is drawn again alone.
+
+    Points count where float32 determines them (`_determined`); all have to come with a small error. Densities are
+    compared at onnxruntime's points: where a flow is steep, what float32 leaves open of a point moves its density
+    by more than the two programs differ.
+    """
+    session, names = open_graph(graph, folder), [t.name for t in graph.outputs]
+    pairs: dict[str, list[tuple[Array, Array]]] = {name: [] for name in names}
+    for feeds in cases:
+        expected = dict(zip(names, draw(lambda f: run_torch(graph, f), feeds), strict=True))
+        found = dict(zip(names, draw(lambda f: session.run(names, f), feeds), strict=True))
+        log_p = _log_densities(spec, feeds["theta"], found["points"])
+        expected["log_prob"] = log_p.sum(-1)
+        there = _log_densities(spec, feeds["theta"], expected["points"])
+        counts = _determined(np.minimum(log_p, there), found["points"])[..., None]
+        expected["points"] = np.where(counts, expected["points"], found["points"])
+        for name in names:
+            pairs[name].append((found[name], expected[name]))
+    return [row(graph.name, name, pairs[name], tolerance(graph.name, name)) for name in names]
+
+
+def _log_densities(spec: FlowSpec, theta: Array, points: Array) -> Array:
+    """log p(x_d given x_<d) [B, N, D] at `points` [B, N, D], by PyTorch."""
+    with torch.no_grad():
+        image = flow.forward(spec, torch.from_numpy(theta), torch.from_numpy(points))
+        return flow.log_prob_terms(spec, image).numpy()
+
+
+def _determined(log_p: Array, points: Array) -> npt.NDArray[np.bool_]:
+    """[B, N]: whether an error of F_d of 1e-6, float32's, leaves x_d known to the tolerance of points."""
+    limit = tolerance("inverse", "points")
+    known = (1e-6 * np.exp(-log_p) < limit.limit * limit.scale(points)).all(axis=-1)
+    return np.asarray(known, np.bool_)
+
+
+def draw(run: Callable[[Feeds], list[Array]], feeds: Feeds) -> list[Array]:
+    """points, log_prob and error of `inverse`, with those that miss their uniforms drawn alone."""
+    outputs = [v.copy() for v in run(feeds)]
+    b, i = np.nonzero(outputs[-1] > MISSED)
+    if len(b):
+        alone = run({"theta": feeds["theta"][b], "uniform": feeds["uniform"][b, i][:, None]})
+        for whole, part in zip(outputs, alone, strict=True):
+            whole[b, i] = part[:, 0]
+    return outputs
 
 
 def require(rows: Sequence[ParityRow]) -> None:
@@ -120,11 +174,11 @@ def row(graph: str, output: str, pairs: Sequence[tuple[Array, Array]], limit: To
 def _path(model: Hcnaf, graphs: dict[str, Graph], folder: Path, scenes: dict[str, Feeds]) -> ParityRow:
     """From the hyper-network's inputs to log p, each side with its own theta."""
     spec, pairs = model.config.flow, []
-    hypernet, flow = open_graph(graphs["hypernet"], folder), open_graph(graphs["flow"], folder)
+    hypernet, density = open_graph(graphs["hypernet"], folder), open_graph(graphs["flow"], folder)
     for feeds in scenes.values():
         expected = run_torch(graphs["hypernet"], feeds)[0].reshape(-1, spec.parameters)
         found = hypernet.run(["theta"], feeds)[0].reshape(expected.shape)
         x = flow_feeds("flow", spec, expected)["points"]
         log_prob = run_torch(graphs["flow"], {"theta": expected, "points": x})[0]
-        pairs.append((flow.run(["log_prob"], {"theta": found, "points": x})[0], log_prob))
+        pairs.append((density.run(["log_prob"], {"theta": found, "points": x})[0], log_prob))
     return row("path", "log_prob", pairs, tolerance("path", "log_prob"))

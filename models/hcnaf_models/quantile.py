@@ -57,8 +57,8 @@ def truncated_quantile(u: Tensor, a: Tensor, b: Tensor) -> Tensor:
     up, down = torch.where(flip, log_v, log_u), torch.where(flip, log_u, log_v)
     log_lo, outer = log_tail(lo), log_tail(torch.where(hi <= 0.0, hi, -hi))
     log_hi = torch.where(hi > 0.0, log1m_exp(outer), outer)
-    lower = torch.logaddexp(down + log_lo, up + log_hi)
-    upper = torch.logaddexp(down + log1m_exp(log_lo), up + outer)
+    lower = log_add_exp(down + log_lo, up + log_hi)
+    upper = log_add_exp(down + log1m_exp(log_lo), up + outer)
     left = (lower <= upper) | (hi < 0.0)  # hi < 0: everything is in the left tail, `upper` means nothing
     z = tail_quantile(torch.where(left, lower, upper))
     z = torch.where(left == flip, -z, z)
@@ -91,6 +91,11 @@ def tail_quantile(log_p: Tensor) -> Tensor:
 def log_tail(z: Tensor) -> Tensor:
     """log Phi(z) for z <= 0: exact in float64, in float32 the fit that the distribution functions use."""
     return torch.special.log_ndtr(z) if z.dtype == torch.float64 else log_left_tail(z)
+
+
+def log_add_exp(a: Tensor, b: Tensor) -> Tensor:
+    """log(exp(a) + exp(b)). torch.logaddexp becomes just that in ONNX: off below -87, -infinity below -104."""
+    return torch.maximum(a, b) + torch.log1p(torch.exp(-torch.abs(a - b)))
 
 
 def log1m_exp(v: Tensor) -> Tensor:

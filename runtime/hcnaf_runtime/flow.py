@@ -27,11 +27,15 @@ DRAWS = 1 << 17
 LANDMARK = 0.1
 """What a column is taken to hold where F_2 alone is asked for: it is then accurate to about 3e-6."""
 
-MISSED = 5e-6
-"""Samples are drawn again alone where F_1 or F_2 misses its uniform by more, one in RARE of them at most: where
-more miss it float32 does not resolve z, and drawing again does not help."""
+MISSED, LOST = 5e-6, 2e-5
+"""Samples are drawn again alone where F_1 or F_2 misses its uniform by more than MISSED, one in RARE of them at
+most: where more miss it float32 does not resolve z, and drawing again does not help. It does help those that miss
+it by more than LOST, which did not get all steps: they are drawn again however many they are."""
 
 RARE = 32
+
+AGAIN = 1 << 22
+"""Numbers of theta, repeated for each sample drawn again, that are run at once."""
 
 
 class Flow(Distribution):
@@ -103,10 +107,9 @@ class Flow(Distribution):
         """`inverse`, at once. The graph's steps are for most samples enough; the others get all of them alone."""
         outputs = ["points", "log_prob", "error"]
         points, log_prob, error = self._run("inverse", outputs, theta=theta, uniform=uniform)
-        late = np.flatnonzero(error > MISSED)
-        if len(late):
-            late = late[np.argsort(error.flat[late])][-max(1, error.size // RARE) :]
-            b, i = np.unravel_index(late, error.shape)
+        late = _late(error)
+        for some in _parts(len(late), -(-len(late) * theta.shape[1] // AGAIN)):
+            b, i = np.unravel_index(late[some], error.shape)
             again = self._run("inverse", outputs, theta=theta[b], uniform=uniform[b, i][:, None])
             better = again[2][:, 0] < error[b, i]
             b, i = b[better], i[better]
@@ -141,6 +144,14 @@ class Flow(Distribution):
     def _run(self, graph: GraphName, outputs: list[str], **feeds: Float32) -> list[Float32]:
         session = self._bundle.session(graph, self._settings)
         return session.run(outputs, {name: np.ascontiguousarray(value) for name, value in feeds.items()})
+
+
+def _late(error: Float32) -> npt.NDArray[np.intp]:
+    """Flat places of the samples to draw again (see MISSED), by their error."""
+    late = np.flatnonzero(error > MISSED)
+    late = late[np.argsort(error.flat[late])]
+    lost = int((error > LOST).sum())
+    return late[-max(1, error.size // RARE, lost) :]
 
 
 def _parts(size: int, count: int) -> list[slice]:

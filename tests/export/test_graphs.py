@@ -6,9 +6,9 @@ import torch
 
 from hcnaf_export.graphs import graphs, weighed_fraction
 from hcnaf_export.onnx_file import EXAMPLE_SIZES, write_onnx
-from hcnaf_export.parity import compare_graph, contract, run_torch
+from hcnaf_export.parity import compare_graph, contract, draw, run_torch
 from hcnaf_export.probes import SCENES, SceneSetting, flow_cases, scene
-from hcnaf_models import planar
+from hcnaf_models import flow, planar
 from hcnaf_models.config import ConditionConfig
 from hcnaf_models.model import build
 from hcnaf_models.spec import FlowSpec
@@ -65,6 +65,22 @@ def test_any_number_of_samples_may_be_drawn(pom, maps, samples):
     feeds = flow_cases("inverse", pom.model.config.flow, {})["random"]
     feeds = {"theta": feeds["theta"][:maps], "uniform": feeds["uniform"][:maps, :samples]}
     same(graph, session(pom, "inverse").run([t.name for t in graph.outputs], feeds), feeds, 1e-4)
+
+
+def test_samples_of_a_distribution_that_is_far_out_in_the_normal_tail(pom):
+    """Where exp(log Phi(z)) is denormal or 0 in float32, as it is for flows that answer absurd scenes."""
+    spec = pom.model.config.flow
+    feeds = flow_cases("inverse", spec, {})["random"]
+    theta = feeds["theta"].copy()
+    theta[:, -spec.dims :] += np.linspace(10.0, 20.0, len(theta), dtype=np.float32)[:, None]
+    drawing, outputs = session(pom, "inverse"), ["points", "log_prob", "error"]
+    found = draw(lambda f: drawing.run(outputs, f), {"theta": theta, "uniform": feeds["uniform"]})
+    image = flow.forward(spec, *(torch.from_numpy(v).double() for v in (theta, found[0])))
+    F = flow.distribution(spec, image.z, image.z_minus, image.z_plus).numpy()
+    assert image.z_minus.min() > 5.0
+    assert image.z.max() > 15.0
+    assert np.abs(F - feeds["uniform"]).max() < 1e-4
+    assert found[2].max() < 1e-4
 
 
 def test_a_scene_may_have_no_stops_and_nobody_else(pom):

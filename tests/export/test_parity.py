@@ -115,6 +115,49 @@ def test_a_graph_that_is_off_by_a_thousandth_is_found(space, tmp_path):
     assert failed == {("flow", "log_prob"), ("path", "log_prob")}
 
 
+def inverse_of(exported):
+    graph = next(g for g in graphs(exported.model) if g.name == "inverse")
+    return graph, flow_cases("inverse", exported.model.config.flow, {})
+
+
+@pytest.mark.parametrize(("output", "amount"), [("points", 0.02), ("log_prob", 0.1), ("error", 2e-5)])
+def test_samples_that_are_off_are_found(pom, tmp_path, output, amount):
+    graph, cases = inverse_of(pom)
+    (tmp_path / "inverse.onnx").write_bytes((pom.path / "inverse.onnx").read_bytes())
+    rows = parity.compare_samples(pom.model.config.flow, graph, tmp_path, list(cases.values()))
+    assert all(r.passed for r in rows), rows
+    shift(tmp_path / "inverse.onnx", output, amount)
+    rows = parity.compare_samples(pom.model.config.flow, graph, tmp_path, list(cases.values()))
+    assert output in {r.output for r in rows if not r.passed}
+
+
+def test_most_probes_of_the_inverse_count(pom):
+    """Points are compared where float32 determines them, which is nearly everywhere."""
+    graph, cases = inverse_of(pom)
+    for name in ("random", "single", "sharp", "wide"):
+        points = parity.run_torch(graph, cases[name])[0]
+        log_p = parity._log_densities(pom.model.config.flow, cases[name]["theta"], points)
+        assert parity._determined(log_p, points).mean() > 0.9
+
+
+def test_samples_that_miss_are_drawn_alone():
+    feeds = {
+        "theta": np.arange(6.0, dtype=np.float32).reshape(2, 3),
+        "uniform": np.linspace(0.1, 0.8, 8, dtype=np.float32).reshape(2, 2, 2),
+    }
+
+    def run(given):
+        """Of several samples the second misses; points say whose they are."""
+        first = given["theta"][:, None, :1] + given["uniform"]
+        error = np.where(np.arange(given["uniform"].shape[1]) == 1, 0.5, 0.0)
+        return [first, first[..., 0], np.broadcast_to(error, first.shape[:2])]
+
+    points, log_prob, error = parity.draw(run, feeds)
+    assert error.max() == 0.0
+    np.testing.assert_array_equal(points, run(feeds)[0])
+    np.testing.assert_array_equal(log_prob, run(feeds)[1])
+
+
 def shift(path, output, amount):
     """Add `amount` to one output of the graph at `path`."""
     model = onnx.load(path)

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from hcnaf_runtime import Bundle, Condition, Forecaster, Grid, Scene, frames
+from hcnaf_runtime import Bundle, Condition, Forecaster, Grid, Scene, flow, frames
 from hcnaf_runtime.errors import BundleError, InputError
+from hcnaf_runtime.flow import RARE
 from hcnaf_runtime.manifest import FILE, encode, read
 
 SEEDS = range(20)
@@ -129,6 +130,34 @@ def test_saved_samples_are_read_back(forecaster, scene, tmp_path):
 def test_what_makes_no_sense_is_refused(forecaster, scene, call, message):
     with pytest.raises(InputError, match=message):
         call(forecaster, scene)
+
+
+@pytest.mark.parametrize("again", [1 << 22, 5])
+@pytest.mark.parametrize(("missed", "left"), [(0.5, 0), (1e-5, 80 - 240 // RARE)])
+def test_samples_that_miss_are_drawn_again_alone(forecaster, monkeypatch, again, missed, left):
+    """All that are lost; of those that miss by little, one in so many."""
+    alone = []
+
+    def run(graph, outputs, theta, uniform):
+        points = theta[:, None, :2] + uniform
+        error = np.zeros(uniform.shape[:2], np.float32)
+        if uniform.shape[1] > 1:
+            error[:, ::3] = missed
+            points[:, ::3] += 1.0
+        else:
+            alone.append(len(uniform))
+        return [points, points.sum(-1), error]
+
+    monkeypatch.setattr(forecaster.flow, "_run", run)
+    monkeypatch.setattr(flow, "AGAIN", again)
+    theta = np.float32([[1.0, 2.0, 0.0], [3.0, 4.0, 0.0]])
+    uniform = np.random.default_rng(1).uniform(0.1, 0.9, (2, 120, 2)).astype(np.float32)
+    points, log_prob = forecaster.flow.inverse(theta, uniform)
+    wrong = np.abs(points - (theta[:, None, :2] + uniform)).max(axis=-1) > 1e-5
+    assert wrong.sum() == left
+    np.testing.assert_allclose(log_prob, points.sum(-1), rtol=1e-6)
+    assert sum(alone) == 80 - left
+    assert max(alone) <= -(-again // theta.shape[1])
 
 
 def test_a_bundle_from_before_samples_says_so(own_bundle, fields):
