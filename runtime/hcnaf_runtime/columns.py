@@ -42,6 +42,9 @@ RESOLVED = 1e-3
 """A rule's nodes may miss F_1 by this share of a column's mass. A spike between two nodes misses it by far
 more, and would otherwise pass for converged, since no rule sees it; accuracy itself is judged by the cells."""
 
+MOST = 0.25
+"""No end of a column loses more than this share of it."""
+
 MARGIN = 2
 """Rows more that a column in doubt gets on either side."""
 
@@ -63,9 +66,7 @@ class Columns:
     ) -> None:
         self.flow, self.theta, self.window = flow, theta, window
         self.tolerance, self.lost_mass = tolerance, lost_mass
-        # Either end of a tile's columns may lose a quarter, the columns left out a half: together lost_mass.
-        ends = max(lost_mass / 4.0, SATURATED[0]), max(lost_mass / 4.0, SATURATED[1])
-        self.canvas = Canvas(flow, theta, window, mass, maps, ends, chunk)
+        self.canvas = Canvas(flow, theta, window, mass, maps, chunk)
 
     def run(self) -> None:
         """Fill the maps."""
@@ -93,6 +94,7 @@ class Columns:
         self.cdf = self.flow.marginal_cdf(self.theta, edges).astype(np.float64)
         self.share = np.maximum(np.diff(self.cdf, axis=1), 0.0)
         self.kept = _kept(self.share, self.lost_mass / 2.0)
+        self.ends = _ends(self.share, self.kept, self.lost_mass)
         self.goal = np.maximum(self.tolerance, _noise(self.window.x) * self.share)
         self.error = np.where(self.kept, 0.0, self.share if self.lost_mass == 0.0 else 0.0)
         # A column more than there are takes what belongs to padding.
@@ -125,15 +127,16 @@ class Columns:
         self._note(tile, found, np.where(unresolved, np.inf, 0.0))
 
     def _rows(self, tile: Tiles, nodes: Nodes) -> TileRows:
-        return TileRows(self.canvas, tile, nodes, self._of(self.share, tile), self._of(self.goal, tile))
+        share, goal, *ends = (self._of(v, tile) for v in (self.share, self.goal, *self.ends))
+        return TileRows(self.canvas, tile, nodes, share, goal, np.stack(ends))
 
     def _held(self, tile: Tiles) -> tuple[Indices, Indices]:
         """The rows `low` to `high` [J] that hold anything, by what is there now, and MARGIN more."""
         mass = self.canvas.mass[self.canvas.maps[tile.maps, None], :, tile.columns]  # [J, w, R]
         below = np.cumsum(mass, axis=-1)
-        share = self._of(self.share, tile)[..., None]
-        empty = np.count_nonzero(below <= self.canvas.ends[0] * share, axis=-1)
-        full = np.count_nonzero(below >= below[..., -1:] - self.canvas.ends[1] * share, axis=-1)
+        low, high = (self._of(end * self.share, tile)[..., None] for end in self.ends)
+        empty = np.count_nonzero(below <= low, axis=-1)
+        full = np.count_nonzero(below >= below[..., -1:] - high, axis=-1)
         low = np.maximum(empty.min(axis=1) - MARGIN, 0)
         high = np.minimum(self.canvas.rows - full.min(axis=1) + 1 + MARGIN, self.canvas.rows)
         return low, np.maximum(high, low)
@@ -178,6 +181,20 @@ def _kept(share: Float64, budget: float) -> Mask:
     threshold = np.take_along_axis(ascending, np.maximum(dropped - 1, 0)[:, None], axis=1)
     threshold = np.where(dropped[:, None] > 0, threshold, 0.0)
     return np.asarray(share > np.maximum(threshold, NEGLIGIBLE))
+
+
+def _ends(share: Float64, kept: Mask, lost_mass: float) -> Float64:
+    """[2, B, C]: the shares that a column's lower and upper end may lose.
+
+    Columns left out may lose half of `lost_mass`, either end of the others a quarter: half of that in shares of
+    what a column holds, and half of it equally, so that columns that hold little are not followed as far out.
+    """
+    count = np.maximum(kept.sum(axis=1, keepdims=True), 1)
+    held = np.maximum(share, 1e-30)
+    ends = np.minimum(lost_mass / 8.0 * (1.0 + 1.0 / (count * held)), MOST)
+    if lost_mass == 0.0:
+        ends = np.minimum(NEGLIGIBLE / held, MOST)
+    return np.stack([np.maximum(ends, least) for least in SATURATED])
 
 
 def _noise(x: Float32) -> Float64:

@@ -59,6 +59,11 @@ class Nodes:
         """How many of the S nodes tiles with `count` columns take: the rest is padding."""
         return np.asarray((count - 1) * self.step + self.bands.shape[-1])
 
+    def columns(self, s: Indices) -> Indices:
+        """The columns that the nodes s lie in, or the nearest to them."""
+        w, K = self.bands.shape[-2:]
+        return np.asarray(np.clip((s - (K - self.step) // 2) // self.step, 0, w - 1))
+
     def some(self, j: Indices, w: int) -> tuple[Float32, Float32, Float32]:
         """Nodes [., S], weights and doubts [., S, w] of the first `w` columns of the tiles j."""
         K = self.bands.shape[-1]
@@ -86,14 +91,13 @@ class Found:
 @dataclass(frozen=True)
 class Canvas:
     """The maps that are filled: theta [B, P], their window, mass [., R, C] to be written, which of it is theirs
-    [B], the share of a column that either end of it may lose, and the most numbers in an intermediate of a run."""
+    [B], and the most numbers in an intermediate of a run."""
 
     flow: Distribution
     theta: Float32
     window: Window
     mass: Float32
     maps: Indices
-    ends: tuple[float, float]
     chunk: int
 
     @property
@@ -104,10 +108,14 @@ class Canvas:
 
 class TileRows:
     """J tiles of w columns, their `nodes`, what each column holds (`share`) and its cells may be wrong by (`goal`)
-    [J, w]; and what they came to, in `found`."""
+    [J, w], the shares of a column that its lower and its upper end may lose (`ends`) [2, J, w]; and what they came
+    to, in `found`."""
 
-    def __init__(self, canvas: Canvas, tile: Tiles, nodes: Nodes, share: Float64, goal: Float64) -> None:
-        self.canvas, self.tile, self.nodes, self.share, self.goal = canvas, tile, nodes, share, goal
+    def __init__(
+        self, canvas: Canvas, tile: Tiles, nodes: Nodes, share: Float64, goal: Float64, ends: Float64
+    ) -> None:
+        self.canvas, self.tile, self.nodes = canvas, tile, nodes
+        self.share, self.goal, self.ends = share, goal, ends
         self.landmarks = panels(canvas.rows, COARSE)
         self.used = nodes.used(tile.count)
         self.found = Found(tile)
@@ -125,7 +133,7 @@ class TileRows:
     def fill_rows(self, low: Indices, high: Indices, which: Indices) -> Found:
         """Compute rows `low` to `high` [J] of the tiles `which`, or all where those miss anything."""
         self._evaluate(low, high, which)
-        allowed = sum(self.canvas.ends) * (self.share * self.tile.own).sum(axis=1) + 1e-9
+        allowed = (self.ends.sum(axis=0) * self.share * self.tile.own).sum(axis=1) + 1e-9
         missed = self.found.outside.sum(axis=1) > allowed
         again = np.flatnonzero(missed & (high - low < self.canvas.rows))
         if len(again):
@@ -139,12 +147,13 @@ class TileRows:
         points, last = self.landmarks.points, self.nodes.x.shape[1] - 1
         scouts = np.append(np.arange(0, last, SCOUTS), last)
         cdf = self._at_landmarks(self.nodes.x[:, scouts])
-        unused = (scouts >= self.used[:, None])[:, None]  # padding decides nothing
-        below = np.where(unused, 0.0, cdf - cdf[:, :1]).max(axis=2)
-        above = np.where(unused, 0.0, cdf[:, -1:] - cdf).max(axis=2)[:, ::-1]
-        rows, ends = self.canvas.rows, self.canvas.ends
-        low = _reach(points, below, ends[0])
-        high = np.maximum(rows - _reach(rows - points[::-1], above, ends[1]), low)
+        ends = self.ends[:, :, self.nodes.columns(scouts)]
+        unused = scouts >= self.used[:, None]  # padding decides nothing
+        rows = self.canvas.rows
+        below = np.where(unused, rows, _reach(points, cdf - cdf[:, :1], ends[0])).min(axis=1)
+        above = _reach(rows - points[::-1], (cdf[:, -1:] - cdf)[:, ::-1], ends[1])
+        low, high = below, rows - np.where(unused, rows, above).min(axis=1)
+        high = np.maximum(high, low)
         return low, high, self._order(*self.landmarks.tails(np.diff(cdf, axis=1)), high - low)
 
     def _order(self, before: Float32, after: Float32, height: Indices) -> Indices:
@@ -258,21 +267,22 @@ def column_sums(mass: Float32) -> Float32:
     return np.asarray((np.ones((1, mass.shape[1]), np.float32) @ mass)[:, 0])
 
 
-def _reach(points: Float64, held: Float32, end: float) -> Indices:
-    """Rows [J] below which less than `end` is held, from what is `held` [J, M] below `points` [M], ascending.
+def _reach(points: Float64, held: Float32, end: Float64) -> Indices:
+    """Rows [J, n] below which less than `end` [J, n] is held, from what is `held` [J, M, n] below `points` [M],
+    ascending.
 
     Between two points the tail is taken as a Gaussian's, and a row is added in case it is not.
     """
     last = len(points) - 1
-    k = np.count_nonzero(held <= end, axis=1) - 1
+    k = np.count_nonzero(held <= end[:, None], axis=1) - 1
+    after = np.minimum(k + 1, last)
     place = points[k]
-    if end > RESOLVED_TAIL:
-        depth = np.sqrt(-2.0 * np.log(np.clip(held, 1e-12, 0.99)))
-        near, far = (np.take_along_axis(depth, np.minimum(k + i, last)[:, None], axis=1)[:, 0] for i in (0, 1))
-        part = (near - np.sqrt(-2.0 * np.log(end))) / np.maximum(near - far, 1e-6)
-        step = points[np.minimum(k + 1, last)] - place
-        place = np.maximum(place + np.clip(part, 0.0, 1.0) * step - 1.0, place)
-    whole: Indices = np.floor(place + 1e-6).astype(np.intp)
+    at = (np.take_along_axis(held, i[:, None], axis=1)[:, 0] for i in (k, after))
+    near, far = (np.sqrt(-2.0 * np.log(np.clip(v, 1e-12, 0.99))) for v in at)
+    part = (near - np.sqrt(-2.0 * np.log(end))) / np.maximum(near - far, 1e-6)
+    step = points[after] - place
+    further = np.maximum(place + np.clip(part, 0.0, 1.0) * step - 1.0, place)
+    whole: Indices = np.floor(np.where(end > RESOLVED_TAIL, further, place) + 1e-6).astype(np.intp)
     return whole
 
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from hcnaf_runtime.cells import _shares
+from hcnaf_runtime.columns import _ends, _kept
 from hcnaf_runtime.plane import Window
 from hcnaf_runtime.tile_rows import Nodes, column_sums
 
@@ -26,6 +27,29 @@ def test_a_column_takes_its_own_nodes(step, K):
                 expected[i, c * step : c * step + K, c] = band[j, c]
         np.testing.assert_array_equal(dense, expected)
     np.testing.assert_array_equal(Nodes(x, bands, step).used(np.array([1, w])), [K, x.shape[1]])
+    column = Nodes(x, bands, step).columns(np.arange(x.shape[1]))
+    np.testing.assert_array_equal(column, [0, 0, 0, 1, 2, 3, 3, 3] if step == 1 else np.repeat(np.arange(4), 7))
+
+
+@pytest.mark.parametrize("lost_mass", [1e-5, 1e-4, 1e-2])
+def test_what_columns_and_their_ends_may_lose_is_the_bound(lost_mass):
+    share = np.random.default_rng(1).dirichlet(np.full(200, 0.1), size=5)
+    kept = _kept(share, lost_mass / 2.0)
+    low, high = _ends(share, kept, lost_mass) * np.where(kept, share, 0.0)
+    lost = np.where(kept, 0.0, share).sum(axis=1) + low.sum(axis=1) + high.sum(axis=1)
+    assert (lost <= lost_mass * 1.001).all()
+    assert (lost >= lost_mass * 0.7).all()
+    light, heavy = (np.where(kept, share, fill) for fill in (1.0, 0.0))
+    rows = np.arange(5)
+    ends = _ends(share, kept, lost_mass)[0]
+    assert (ends[rows, light.argmin(axis=1)] > 10.0 * ends[rows, heavy.argmax(axis=1)]).all()
+
+
+def test_a_dense_map_loses_what_float32_does_not_tell_from_nothing():
+    share = np.array([[0.9, 0.1 - 1e-8, 1e-8, 0.0]])
+    low, high = _ends(share, _kept(share, 0.0), 0.0)
+    np.testing.assert_allclose(low[0], [1e-9 / 0.9, 1e-8, 0.1, 0.25], rtol=1e-6)
+    np.testing.assert_allclose(high[0], [1.5e-7, 1.5e-7, 0.1, 0.25], rtol=1e-6)
 
 
 def test_column_sums():
