@@ -13,7 +13,7 @@ from hcnaf_export.describe import HYPERNET_IN
 from hcnaf_export.graphs import Graph
 from hcnaf_export.parity import open_graph, run_torch
 from hcnaf_export.probes import SEED, Feeds, SceneSetting, conditions, edges, flow_feeds, scene
-from hcnaf_export.tolerances import GOLDEN_FACTOR, GOLDEN_INT8, tolerance
+from hcnaf_export.tolerances import GOLDEN_FACTOR, GOLDEN_INT8, UNITS, tolerance
 from hcnaf_models.config import ConditionConfig, PomConfig
 from hcnaf_models.model import Hcnaf
 from hcnaf_runtime.manifest import Precision
@@ -41,7 +41,7 @@ def golden(
         if graph.name in HYPERNET_IN:
             arrays |= _entries(graph, inputs | edges(), converted, precision)
         else:
-            arrays |= _entries(graph, flow_feeds(graph.name, spec, theta))
+            arrays |= _entries(graph, flow_feeds(graph.name, spec, theta), hidden=spec.hidden)
     return arrays
 
 
@@ -54,13 +54,17 @@ def _hypernet_feeds(model: Hcnaf) -> Feeds:
 
 
 def _entries(
-    graph: Graph, feeds: Feeds, converted: Path | None = None, precision: Precision = "fp32"
+    graph: Graph,
+    feeds: Feeds,
+    converted: Path | None = None,
+    precision: Precision = "fp32",
+    hidden: int = UNITS,
 ) -> dict[str, Array]:
     arrays = {f"in.{graph.name}.{name}": value for name, value in feeds.items()}
     names = [tensor.name for tensor in graph.outputs]
     found = open_graph(graph, converted).run(names, feeds) if converted else run_torch(graph, feeds)
     for name, value in zip(names, found, strict=True):
-        limit = GOLDEN_FACTOR * tolerance(graph.name, name).limit
+        limit = GOLDEN_FACTOR * tolerance(graph.name, name, hidden).limit
         arrays[f"out.{graph.name}.{name}"] = value
         arrays[f"tol.{graph.name}.{name}"] = np.array(max(limit, GOLDEN_INT8 if precision == "int8" else 0.0))
     return arrays

@@ -16,7 +16,7 @@ import torch
 
 from hcnaf_export.graphs import Graph
 from hcnaf_export.probes import Feeds, flow_cases, flow_feeds, forecast_feeds, hypernet_feeds
-from hcnaf_export.tolerances import Tolerance, tolerance
+from hcnaf_export.tolerances import UNITS, Tolerance, tolerance
 from hcnaf_models import flow
 from hcnaf_models.model import Hcnaf
 from hcnaf_models.spec import FlowSpec
@@ -62,18 +62,19 @@ def compare(model: Hcnaf, graphs: Sequence[Graph], folder: Path) -> list[ParityR
             cases = forecast_feeds(scenes)
         else:
             cases = scenes if graph.name == "hypernet" else flow_cases(graph.name, model.config.flow, trained)
-        rows += compare_graph(graph, folder, list(cases.values()))
+        rows += compare_graph(graph, folder, list(cases.values()), model.config.flow.hidden)
     return [*rows, _path(model, by_name, folder, scenes)]
 
 
-def compare_graph(graph: Graph, folder: Path, cases: Sequence[Feeds]) -> list[ParityRow]:
-    """One row per output of one graph, over `cases`."""
+def compare_graph(graph: Graph, folder: Path, cases: Sequence[Feeds], hidden: int = UNITS) -> list[ParityRow]:
+    """One row per output of one graph, over `cases`, for a flow of so many `hidden` units."""
     session, names = open_graph(graph, folder), [t.name for t in graph.outputs]
     expected = [run_torch(graph, feeds) for feeds in cases]
     found = [session.run(names, feeds) for feeds in cases]
     outputs = zip(names, zip(*found, strict=True), zip(*expected, strict=True), strict=True)
     return [
-        row(graph.name, name, list(zip(a, b, strict=True)), tolerance(graph.name, name)) for name, a, b in outputs
+        row(graph.name, name, list(zip(a, b, strict=True)), tolerance(graph.name, name, hidden))
+        for name, a, b in outputs
     ]
 
 

@@ -11,7 +11,8 @@ absurd weights, and there log p is a square of thousands.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -22,6 +23,10 @@ Array = npt.NDArray[np.floating]
 LEAST = -745.0
 """exp of less is 0 in float64."""
 
+UNITS = 20
+"""Rounding of a sum grows with the root of its terms: with three layers of 100 units PyTorch's own F_2 has been
+found 2.4e-6 from float64, with 20 units 9e-7."""
+
 FAINT, NOTHING = 1e-5, 1e-4
 """Shares by which a logarithm may differ below -knee, and below LEAST."""
 
@@ -29,12 +34,13 @@ FAINT, NOTHING = 1e-5, 1e-4
 @dataclass(frozen=True)
 class Tolerance:
     """`limit` on the error as defined above, for the `reason` given; `logarithm` where v is a log-density from
-    scene to density."""
+    scene to density, `sums` where the limit is that of sums over H = UNITS and grows with the root of H."""
 
     limit: float
     knee: float
     reason: str
     logarithm: bool = False
+    sums: bool = False
 
     def error(self, found: Array, expected: Array) -> npt.NDArray[np.float64]:
         """The error of every value; infinite where either side is not finite."""
@@ -64,11 +70,11 @@ TOLERANCES: dict[tuple[str, str], Tolerance] = {
     ),
     ("flow", "z"): Tolerance(2e-5, 1.0, "a sum over H units of magnitude above |z|"),
     ("flow", "log_det"): Tolerance(1e-4, 50.0, "nats; sums of L + 1 logarithms of positive sums"),
-    ("marginal_cdf", "cdf"): Tolerance(2e-6, 1.0, _PROBABILITY),
-    ("conditional_cdf", "cdf"): Tolerance(2e-6, 1.0, _PROBABILITY),
+    ("marginal_cdf", "cdf"): Tolerance(2e-6, 1.0, _PROBABILITY, sums=True),
+    ("conditional_cdf", "cdf"): Tolerance(2e-6, 1.0, _PROBABILITY, sums=True),
     ("cell_mass", "mass"): Tolerance(1e-6, 1.0, "the promise made for cell masses"),
     ("cell_mass", "error"): Tolerance(2e-6, 1.0, "an estimate, of masses that agree"),
-    ("cell_mass", "cdf"): Tolerance(2e-6, 1.0, _PROBABILITY),
+    ("cell_mass", "cdf"): Tolerance(2e-6, 1.0, _PROBABILITY, sums=True),
     ("inverse", "points"): Tolerance(1e-3, 1.0, "z's error over dz/dx, which is small where hardly anything is"),
     ("inverse", "log_prob"): Tolerance(1e-3, 50.0, "nats; the density at a point that is as far off"),
     ("inverse", "error"): Tolerance(1e-5, 1.0, "what is left of F_1 and F_2 by rounding"),
@@ -91,6 +97,9 @@ MOST_NATS = {"fp16": 0.05, "int8": 0.5}
 """Mean |change of log p| (nats) above which a precision is refused: the export has failed, not merely rounded."""
 
 
-def tolerance(graph: str, output: str) -> Tolerance:
-    """The tolerance of one output."""
-    return TOLERANCES[graph, output]
+def tolerance(graph: str, output: str, hidden: int = UNITS) -> Tolerance:
+    """The tolerance of one output, for a flow with so many `hidden` units per dimension."""
+    found = TOLERANCES[graph, output]
+    if not found.sums:
+        return found
+    return replace(found, limit=found.limit * max(1.0, math.sqrt(hidden / UNITS)))

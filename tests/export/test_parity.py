@@ -6,7 +6,7 @@ from hcnaf_export import parity
 from hcnaf_export.graphs import graphs
 from hcnaf_export.parity import compare, require, row
 from hcnaf_export.probes import flow_cases
-from hcnaf_export.tolerances import TOLERANCES, Tolerance
+from hcnaf_export.tolerances import TOLERANCES, Tolerance, tolerance
 from hcnaf_models.config import ConditionConfig
 from hcnaf_models.model import build
 from hcnaf_models.spec import FlowSpec
@@ -74,6 +74,16 @@ def test_every_output_has_a_tolerance_and_a_reason():
     outputs = {(g.name, t.name) for g in parts for t in g.outputs}
     assert outputs <= set(TOLERANCES)
     assert all(t.limit > 0 and t.knee > 0 and len(t.reason) > 10 for t in TOLERANCES.values())
+
+
+def test_probabilities_of_larger_flows_may_differ_by_the_root_of_their_units():
+    assert (
+        tolerance("conditional_cdf", "cdf")
+        == tolerance("conditional_cdf", "cdf", 8)
+        == TOLERANCES["conditional_cdf", "cdf"]
+    )
+    assert tolerance("conditional_cdf", "cdf", 80).limit == pytest.approx(4e-6)
+    assert tolerance("cell_mass", "mass", 80).limit == 1e-6
 
 
 @pytest.mark.parametrize("name", ["flow", "marginal_cdf", "conditional_cdf", "cell_mass"])
