@@ -22,13 +22,12 @@ import torch
 from numpy.typing import NDArray
 
 from hcnaf_export.baselines.tracks import TrackGaussian
-from hcnaf_export.checkpoint import load_checkpoint
 from hcnaf_export.data.eth_ucy import PREDICTED, TEST, Windows, split
 from hcnaf_export.evaluation.paths import score_paths
+from hcnaf_export.experiments.cells import train_cell
 from hcnaf_export.recipe import TrackRecipe, read_recipe
 from hcnaf_export.training.eth_ucy import batches, score, theta_of
 from hcnaf_export.training.loop import Progress
-from hcnaf_export.training.run import run_training
 from hcnaf_models.config import HeadKind
 from hcnaf_models.model import Hcnaf
 from hcnaf_runtime.npz import write_npz
@@ -121,29 +120,17 @@ def run_cell(
     """Train and score a cell unless it is done. Returns False if interrupted.
 
     Raises:
-        RecipeError, DataError, CheckpointError, TrainingError: see `run_training`.
+        RecipeError, DataError, CheckpointError, TrainingError: see `train_cell`.
     """
     folder = cell_folder(plan.out, split_name, model, seed)
     if (folder / "scores.npz").is_file():
         return True
     recipe, start = cell_recipe(plan, split_name, model, seed), time.process_time()
-    result = run_training(
-        recipe,
-        plan.data,
-        folder,
-        resume=(folder / "checkpoint.pt").is_file(),
-        threads=plan.threads,
-        progress=report,
-    )
-    if not result.finished:
+    trained = train_cell(recipe, plan.data, folder, plan.threads, report)
+    if trained is None:
         return False
-    loaded = load_checkpoint(folder / "model.pt")
-    facts = {
-        "steps": result.step,
-        "seconds": round(result.seconds, 1),
-        "cpu_seconds": round(time.process_time() - start, 1),
-        "validation": result.scores.get("mean"),
-    }
+    loaded, facts = trained
+    facts["cpu_seconds"] = round(time.process_time() - start, 1)
     _save(folder / "scores.npz", score_model(loaded.model, split(plan.data, split_name).test, facts))
     return True
 

@@ -20,16 +20,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hcnaf_export.baselines import ConstantVelocityGaussian
-from hcnaf_export.checkpoint import Checkpoint, load_checkpoint
+from hcnaf_export.checkpoint import Checkpoint
 from hcnaf_export.data.tracks import Dataset
 from hcnaf_export.evaluation.checkpoint_predictor import CheckpointPredictor
 from hcnaf_export.evaluation.evaluate import HORIZONS
 from hcnaf_export.evaluation.subset import Part, cluster_of, parts
+from hcnaf_export.experiments.cells import train_cell
 from hcnaf_export.experiments.lost_mass import lost_mass
 from hcnaf_export.experiments.occupancy_grids import GRIDS, ExperimentGrid
 from hcnaf_export.recipe import PomRecipe, from_plain, read_recipe, to_plain
 from hcnaf_export.training.loop import Progress
-from hcnaf_export.training.run import run_training
 from hcnaf_runtime.npz import write_npz
 
 Float = NDArray[np.float64]
@@ -108,28 +108,16 @@ def run_cell(plan: Plan, cell: str, seed: int, report: Callable[[Progress], None
     """Train and score a cell unless it is done. Returns False if interrupted.
 
     Raises:
-        RecipeError, DataError, CheckpointError, TrainingError: see `run_training`.
+        RecipeError, DataError, CheckpointError, TrainingError: see `train_cell`.
     """
     folder = cell_folder(plan.out, cell, seed)
     if (folder / FILE).is_file():
         return True
-    result = run_training(
-        cell_recipe(plan, cell, seed),
-        plan.data,
-        folder,
-        resume=(folder / "checkpoint.pt").is_file(),
-        threads=plan.threads,
-        progress=report,
-    )
-    if not result.finished:
+    trained = train_cell(cell_recipe(plan, cell, seed), plan.data, folder, plan.threads, report)
+    if trained is None:
         return False
-    loaded = load_checkpoint(folder / "model.pt")
-    facts = {
-        "steps": result.step,
-        "seconds": round(result.seconds, 1),
-        "validation": result.scores.get("mean"),
-        "parameters": sum(p.numel() for p in loaded.model.parameters()),
-    }
+    loaded, facts = trained
+    facts["parameters"] = sum(p.numel() for p in loaded.model.parameters())
     save_cell(folder, score_model(loaded, test_windows(plan.data), facts))
     return True
 
