@@ -38,6 +38,9 @@ NEGLIGIBLE = 1e-9
 SATURATED = 1e-9, 1.5e-7
 """What float32 resolves near 0 and near 1: F_2 this close to its value at the window's edge is flat up to it."""
 
+ROUNDED = 5e-7
+"""What a map may lose to these two, and what is lost in rounding: it is no one's to spend."""
+
 RESOLVED = 1e-3
 """A rule's nodes may miss F_1 by this share of a column's mass. A spike between two nodes misses it by far
 more, and would otherwise pass for converged, since no rule sees it; accuracy itself is judged by the cells."""
@@ -65,7 +68,7 @@ class Columns:
         chunk: int,
     ) -> None:
         self.flow, self.theta, self.window = flow, theta, window
-        self.tolerance, self.lost_mass = tolerance, lost_mass
+        self.tolerance, self.budget = tolerance, max(lost_mass - ROUNDED, 0.0)
         self.canvas = Canvas(flow, theta, window, mass, maps, chunk)
 
     def run(self) -> None:
@@ -93,10 +96,10 @@ class Columns:
         edges = np.broadcast_to(self.window.x, (len(self.theta), len(self.window.x)))
         self.cdf = self.flow.marginal_cdf(self.theta, edges).astype(np.float64)
         self.share = np.maximum(np.diff(self.cdf, axis=1), 0.0)
-        self.kept = _kept(self.share, self.lost_mass / 2.0)
-        self.ends = _ends(self.share, self.kept, self.lost_mass)
+        self.kept = _kept(self.share, self.budget / 2.0)
+        self.ends = _ends(self.share, self.kept, self.budget)
         self.goal = np.maximum(self.tolerance, _noise(self.window.x) * self.share)
-        self.error = np.where(self.kept, 0.0, self.share if self.lost_mass == 0.0 else 0.0)
+        self.error = np.where(self.kept, 0.0, self.share if self.budget == 0.0 else 0.0)
         # A column more than there are takes what belongs to padding.
         self.inside = np.zeros(self.cdf.shape)
         self.outside = np.pad(np.where(self.kept, 0.0, self.share), ((0, 0), (0, 1)))
@@ -183,16 +186,16 @@ def _kept(share: Float64, budget: float) -> Mask:
     return np.asarray(share > np.maximum(threshold, NEGLIGIBLE))
 
 
-def _ends(share: Float64, kept: Mask, lost_mass: float) -> Float64:
+def _ends(share: Float64, kept: Mask, budget: float) -> Float64:
     """[2, B, C]: the shares that a column's lower and upper end may lose.
 
-    Columns left out may lose half of `lost_mass`, either end of the others a quarter: half of that in shares of
-    what a column holds, and half of it equally, so that columns that hold little are not followed as far out.
+    Columns left out may lose half of `budget`, either end of the others a quarter: half of that in shares of what
+    a column holds, and half of it equally, so that columns that hold little are not followed as far out.
     """
     count = np.maximum(kept.sum(axis=1, keepdims=True), 1)
     held = np.maximum(share, 1e-30)
-    ends = np.minimum(lost_mass / 8.0 * (1.0 + 1.0 / (count * held)), MOST)
-    if lost_mass == 0.0:
+    ends = np.minimum(budget / 8.0 * (1.0 + 1.0 / (count * held)), MOST)
+    if budget == 0.0:
         ends = np.minimum(NEGLIGIBLE / held, MOST)
     return np.stack([np.maximum(ends, least) for least in SATURATED])
 

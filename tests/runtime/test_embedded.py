@@ -28,3 +28,12 @@ def test_forecasts_every_sample():
 
 def test_fits_the_wheel():
     assert sum(path.stat().st_size for path in (EMBEDDED / "model").iterdir()) < 5_000_000
+
+
+@pytest.mark.parametrize("lost_mass", [1e-6, 1e-4, 1e-2])
+@pytest.mark.parametrize("name", sorted(embedded_scenes()))
+def test_trained_forecasts_lose_no_more_than_asked(name, lost_mass):
+    """Also where the bound is close to what float32 tells apart."""
+    maps = Forecaster(threads=1).pom(Scene.load(embedded_scenes()[name]), lost_mass=lost_mass)
+    assert (maps.lost_mass <= lost_mass).all()
+    assert (maps.lost_mass >= 0.2 * lost_mass).mean() > 0.5
