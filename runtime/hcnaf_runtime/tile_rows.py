@@ -147,7 +147,7 @@ class TileRows:
         points, last = self.landmarks.points, self.nodes.x.shape[1] - 1
         scouts = np.append(np.arange(0, last, SCOUTS), last)
         cdf = self._at_landmarks(self.nodes.x[:, scouts])
-        ends = self.ends[:, :, self.nodes.columns(scouts)]
+        ends = self._least_ends(scouts)
         unused = scouts >= self.used[:, None]  # padding decides nothing
         rows = self.canvas.rows
         below = np.where(unused, rows, _reach(points, cdf - cdf[:, :1], ends[0])).min(axis=1)
@@ -155,6 +155,11 @@ class TileRows:
         low, high = below, rows - np.where(unused, rows, above).min(axis=1)
         high = np.maximum(high, low)
         return low, high, self._order(*self.landmarks.tails(np.diff(cdf, axis=1)), high - low)
+
+    def _least_ends(self, scouts: Indices) -> Float64:
+        """[2, J, len(scouts)]: the least that ends of columns may lose, of those nearest to each scout."""
+        first = np.append(0, (scouts[1:] + scouts[:-1]) // 2)
+        return np.asarray(np.minimum.reduceat(self.ends, self.nodes.columns(first), axis=2))
 
     def _order(self, before: Float32, after: Float32, height: Indices) -> Indices:
         """The least of ORDERS [J] that is enough as landmarks tell and pays for so many rows [J]; 0 for none."""

@@ -6,7 +6,7 @@ import pytest
 from hcnaf_runtime.cells import _shares
 from hcnaf_runtime.columns import _ends, _kept
 from hcnaf_runtime.plane import Window
-from hcnaf_runtime.tile_rows import Nodes, column_sums
+from hcnaf_runtime.tile_rows import Nodes, TileRows, column_sums
 
 WINDOW = Window(np.arange(5, dtype=np.float32), np.arange(4, dtype=np.float32))
 
@@ -29,6 +29,19 @@ def test_a_column_takes_its_own_nodes(step, K):
     np.testing.assert_array_equal(Nodes(x, bands, step).used(np.array([1, w])), [K, x.shape[1]])
     column = Nodes(x, bands, step).columns(np.arange(x.shape[1]))
     np.testing.assert_array_equal(column, [0, 0, 0, 1, 2, 3, 3, 3] if step == 1 else np.repeat(np.arange(4), 7))
+
+
+def test_a_scout_looks_out_for_the_columns_around_it():
+    """A column that holds much beside one that holds little: what is negligible for the latter is not for it."""
+    rng = np.random.default_rng(0)
+    w, K = 20, 5
+    rows = object.__new__(TileRows)
+    rows.nodes = Nodes(np.zeros((2, w + K - 1), np.float32), np.zeros((2, 2, w, K), np.float32), 1)
+    rows.ends = rng.uniform(size=(2, 2, w))
+    scouts = np.array([0, 8, 16, 23])
+    nearest = np.abs(np.arange(w)[:, None] + 2 - scouts + 0.1).argmin(axis=1)
+    expected = np.stack([rows.ends[:, :, nearest == s].min(axis=-1) for s in range(4)], axis=-1)
+    np.testing.assert_array_equal(rows._least_ends(scouts), expected)
 
 
 @pytest.mark.parametrize("lost_mass", [1e-5, 1e-4, 1e-2])
