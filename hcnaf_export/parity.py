@@ -49,20 +49,19 @@ def run_torch(graph: Graph, feeds: Feeds) -> list[Array]:
 
 def compare(model: Hcnaf, graphs: Sequence[Graph], folder: Path) -> list[ParityRow]:
     """One row per graph and output for the .onnx files in `folder`. Differences do not raise: see `require`."""
-    by_name: dict[str, Graph] = {g.name: g for g in graphs}
+    spec, by_name = model.config.flow, {str(g.name): g for g in graphs}
     scenes = hypernet_feeds(model)
     trained = {name: run_torch(by_name["hypernet"], feeds)[0] for name, feeds in scenes.items()}
     rows: list[ParityRow] = []
     for graph in graphs:
-        if graph.name == "inverse":
-            cases = flow_cases(graph.name, model.config.flow, trained)
-            rows += compare_samples(model.config.flow, graph, folder, list(cases.values()))
-            continue
         if graph.name == "forecast":
             cases = forecast_feeds(scenes)
         else:
-            cases = scenes if graph.name == "hypernet" else flow_cases(graph.name, model.config.flow, trained)
-        rows += compare_graph(graph, folder, list(cases.values()), model.config.flow.hidden)
+            cases = scenes if graph.name == "hypernet" else flow_cases(graph.name, spec, trained)
+        if graph.name == "inverse":
+            rows += compare_samples(spec, graph, folder, list(cases.values()))
+        else:
+            rows += compare_graph(graph, folder, list(cases.values()), spec.hidden)
     return [*rows, _path(model, by_name, folder, scenes)]
 
 
@@ -81,20 +80,19 @@ def compare_graph(graph: Graph, folder: Path, cases: Sequence[Feeds], hidden: in
 def compare_samples(spec: FlowSpec, graph: Graph, folder: Path, cases: Sequence[Feeds]) -> list[ParityRow]:
     """The rows of graph `inverse`, used as its contract says: what comes with a large error is drawn again alone.
 
-    Points count where float32 determines them (`_determined`); all have to come with a small error. Densities are
-    compared at onnxruntime's points: where a flow is steep, what float32 leaves open of a point moves its density
-    by more than the two programs differ.
+    Points count where float32 determines PyTorch's (`_determined`); all have to come with as small an error.
+    Densities are compared at onnxruntime's points: where a flow is steep, what float32 leaves open of a point
+    moves its density by more than the two programs differ.
     """
     session, names = open_graph(graph, folder), [t.name for t in graph.outputs]
     pairs: dict[str, list[tuple[Array, Array]]] = {name: [] for name in names}
     for feeds in cases:
         expected = dict(zip(names, draw(lambda f: run_torch(graph, f), feeds), strict=True))
         found = dict(zip(names, draw(lambda f: session.run(names, f), feeds), strict=True))
-        log_p = _log_densities(spec, feeds["theta"], found["points"])
-        expected["log_prob"] = log_p.sum(-1)
-        there = _log_densities(spec, feeds["theta"], expected["points"])
-        counts = _determined(np.minimum(log_p, there), found["points"])[..., None]
-        expected["points"] = np.where(counts, expected["points"], found["points"])
+        expected["log_prob"] = _log_densities(spec, feeds["theta"], found["points"]).sum(-1)
+        there = expected["points"]
+        counts = _determined(_log_densities(spec, feeds["theta"], there), there)[..., None]
+        expected["points"] = np.where(counts, there, found["points"])
         for name in names:
             pairs[name].append((found[name], expected[name]))
     return [row(graph.name, name, pairs[name], tolerance(graph.name, name)) for name in names]

@@ -194,10 +194,8 @@ def _ends(share: Float64, kept: Mask, budget: float) -> Float64:
     """
     count = np.maximum(kept.sum(axis=1, keepdims=True), 1)
     held = np.maximum(share, 1e-30)
-    ends = np.minimum(budget / 8.0 * (1.0 + 1.0 / (count * held)), MOST)
-    if budget == 0.0:
-        ends = np.minimum(NEGLIGIBLE / held, MOST)
-    return np.stack([np.maximum(ends, least) for least in SATURATED])
+    ends = budget / 8.0 * (1.0 + 1.0 / (count * held)) if budget else NEGLIGIBLE / held
+    return np.stack([np.clip(ends, least, MOST) for least in SATURATED])
 
 
 def _noise(x: Float32) -> Float64:

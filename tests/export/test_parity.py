@@ -130,7 +130,9 @@ def inverse_of(exported):
     return graph, flow_cases("inverse", exported.model.config.flow, {})
 
 
-@pytest.mark.parametrize(("output", "amount"), [("points", 0.02), ("log_prob", 0.1), ("error", 2e-5)])
+@pytest.mark.parametrize(
+    ("output", "amount"), [("points", 0.02), ("points", 1e5), ("log_prob", 0.1), ("error", 2e-5)]
+)
 def test_samples_that_are_off_are_found(pom, tmp_path, output, amount):
     graph, cases = inverse_of(pom)
     (tmp_path / "inverse.onnx").write_bytes((pom.path / "inverse.onnx").read_bytes())
