@@ -8,9 +8,11 @@ Columns of all maps are pooled in tiles, and tiles in batches of bounded size.
 import numpy as np
 import numpy.typing as npt
 
+from hcnaf_runtime import smooth
+from hcnaf_runtime.canvas import Canvas
 from hcnaf_runtime.plane import Distribution, Window
 from hcnaf_runtime.quadrature import Halo, Rule
-from hcnaf_runtime.tile_rows import Canvas, Found, Nodes, TileRows
+from hcnaf_runtime.tile_rows import Found, Nodes, TileRows
 from hcnaf_runtime.tiles import Tiles, batches, cut
 
 Float32 = npt.NDArray[np.float32]
@@ -74,6 +76,13 @@ class Columns:
     def run(self) -> None:
         """Fill the maps."""
         self._begin()
+        done = self._smooth()
+        if not done.all():
+            self._tiles(~done)
+
+    def _tiles(self, wanted: Mask) -> None:
+        """Fill the maps `wanted` [B] tile by tile."""
+        self._clear(wanted)
         tiles = cut(self.kept, WIDTH, gap=2 * HALO.reach)
         for some in batches(tiles.count + 2 * HALO.reach, BATCH):
             self._centres(tiles.some(some))
@@ -90,19 +99,38 @@ class Columns:
                 pending &= (self.error < 0.9 * before) | (self.error >= self.share)
 
     def _begin(self) -> None:
-        """Empty maps, and what F_1 tells: the columns' shares, and which of them to keep."""
-        for k in self.canvas.maps:
-            self.canvas.mass[k] = 0.0
-        edges = np.broadcast_to(self.window.x, (len(self.theta), len(self.window.x)))
-        self.cdf = self.flow.marginal_cdf(self.theta, edges).astype(np.float64)
+        """What F_1 tells: the columns' shares, and what cells may be wrong by."""
+        left, right = self.window.x[:1], self.window.x[-1:]
+        further = np.arange(1, smooth.AROUND + 1, dtype=np.float32) * (right - left) / (len(self.window.x) - 1)
+        edges = np.concatenate([left - further[::-1], self.window.x, right + further])
+        edges = np.broadcast_to(edges, (len(self.theta), len(edges)))
+        self.around = self.flow.marginal_cdf(self.theta, edges).astype(np.float64)
+        self.cdf = self.around[:, smooth.AROUND : -smooth.AROUND]
         self.share = np.maximum(np.diff(self.cdf, axis=1), 0.0)
-        self.kept = _kept(self.share, self.budget / 2.0)
-        self.ends = _ends(self.share, self.kept, self.budget)
         self.goal = np.maximum(self.tolerance, _noise(self.window.x) * self.share)
-        self.error = np.where(self.kept, 0.0, self.share if self.budget == 0.0 else 0.0)
+        self.error = np.zeros_like(self.share)
         # A column more than there are takes what belongs to padding.
-        self.inside = np.zeros(self.cdf.shape)
-        self.outside = np.pad(np.where(self.kept, 0.0, self.share), ((0, 0), (0, 1)))
+        self.inside, self.outside = np.zeros((2, *self.cdf.shape))
+
+    def _smooth(self) -> Mask:
+        """Fill maps whose F_2 is smooth both ways. Which of them are [B]."""
+        done = np.zeros(len(self.theta), np.bool_)
+        for found in smooth.fill(self.canvas, self.around, self.goal):
+            self.inside[found.maps, :-1] = found.inside
+            self.error[found.maps] = found.error
+            done[found.maps] = True
+        return done
+
+    def _clear(self, wanted: Mask) -> None:
+        """The maps `wanted` [B] empty, and which of their columns to keep."""
+        for k in self.canvas.maps[wanted]:
+            self.canvas.mass[k] = 0.0
+        self.kept = _kept(self.share, self.budget / 2.0) & wanted[:, None]
+        self.ends = _ends(self.share, self.kept, self.budget)
+        dropped = wanted[:, None] & ~self.kept
+        self.outside[:, :-1][dropped] = self.share[dropped]
+        if self.budget == 0.0:
+            self.error[dropped] = self.share[dropped]
 
     def _centres(self, tile: Tiles) -> None:
         """One node per column."""

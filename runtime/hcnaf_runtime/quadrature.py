@@ -52,6 +52,16 @@ class Rule:
         """[..., S]: the weights of the nodes for the values `F` [..., len(support)] of the distribution."""
         return (F[..., self._panel] @ self._derivative).reshape(*F.shape[:-1], self.size)
 
+    def at(self, places: Float64) -> Float64:
+        """[n, S]: values at `places` [n] on the unit interval from those at the nodes, by the polynomial through
+        the nodes of the panel that a place lies in."""
+        panel = np.minimum((places * self.panels).astype(np.intp), self.panels - 1)
+        found, t = np.zeros((len(places), self.panels, self.order)), _gauss(self.order)[0]
+        within = places * self.panels - panel
+        for j in range(self.order):
+            found[np.arange(len(places)), panel, j] = _lagrange(t, j, within)
+        return found.reshape(len(places), self.size)
+
     @cached_property
     def doubt(self) -> Float64:
         """[S, S]: values at the nodes minus those of the polynomial through all nodes of a panel but the second

@@ -11,24 +11,28 @@ from functools import cached_property, lru_cache
 import numpy as np
 import numpy.typing as npt
 
+from hcnaf_runtime.products import product
+
 Float32 = npt.NDArray[np.float32]
 Float64 = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.intp]
 
 TALLEST, MOST = 64, 8
-"""A panel has at most so many rows, unless there were more than so many panels."""
+"""A panel has at most so many rows, unless another height is asked for or there were more than so many panels."""
 
 
 @dataclass(frozen=True)
 class Panels:
-    """`rows` rows in panels of equal height, each with `order` + 1 points."""
+    """`rows` rows in panels of equal height, at most `tallest`, each with `order` + 1 points."""
 
     rows: int
     order: int
+    tallest: int = TALLEST
 
     @property
     def count(self) -> int:
         """How many panels there are."""
-        return min(-(-self.rows // TALLEST), MOST)
+        return min(-(-self.rows // self.tallest), MOST)
 
     @cached_property
     def points(self) -> Float64:
@@ -42,9 +46,25 @@ class Panels:
         low, high = float(edges[0]), float(edges[-1])
         return (low + (high - low) / self.rows * self.points).astype(np.float32)
 
-    def increments(self, between: Float32) -> Float32:
-        """[..., rows, C]: a function's increments from row to row, from those `between` points [..., n, C]."""
-        return self._from_gaps @ between
+    def increments(self, between: Float32, out: Float32 | None = None) -> Float32:
+        """[..., rows, C]: a function's increments from row to row, from those `between` points [..., n, C]; into
+        `out` if given."""
+        if self.rows % self.count:
+            return product(self._from_gaps, between, out)
+        *lead, _, C = between.shape
+        if out is None:
+            out = np.empty((*lead, self.rows, C), np.float32)
+        into = out.reshape(*lead, self.count, -1, C)  # never a copy: only the rows are divided
+        product(self._from_own_gaps, between.reshape(*lead, self.count, self.order, C), into)
+        return out
+
+    def at(self, edges: Indices) -> Float32:
+        """[n, count order + 1]: a function's values at these row `edges` [n] from those at the points."""
+        from_gaps = np.concatenate([np.zeros_like(self._from_gaps[:1]), np.cumsum(self._from_gaps, axis=0)])[edges]
+        ends = np.pad(from_gaps, ((0, 0), (1, 1)))
+        found: Float32 = ends[:, :-1] - ends[:, 1:]
+        found[:, 0] += 1.0
+        return found
 
     def tails(self, between: Float32) -> tuple[Float32, Float32]:
         """[...] twice: how large the last two Chebyshev coefficients but two, and the last two, are at worst, from
@@ -67,6 +87,13 @@ class Panels:
         return np.diff(at_edges, axis=0).astype(np.float32)
 
     @cached_property
+    def _from_own_gaps(self) -> Float32:
+        """[rows / count, order]: increments of a panel's rows from those between its points, if rows are divided
+        equally."""
+        own = _interpolation(_chebyshev(self.order), np.linspace(0.0, 1.0, self.rows // self.count + 1))
+        return (np.diff(own, axis=0) @ _sums(self.order)).astype(np.float32)
+
+    @cached_property
     def _modes(self) -> Float32:
         """[4, order]: the last four Chebyshev coefficients from the increments between a panel's points."""
         values = np.polynomial.chebyshev.chebvander(2.0 * _chebyshev(self.order) - 1.0, self.order)
@@ -74,9 +101,18 @@ class Panels:
 
 
 @lru_cache(maxsize=16)
-def panels(rows: int, order: int) -> Panels:
+def panels(rows: int, order: int, tallest: int = TALLEST) -> Panels:
     """The panels of so many rows; what belongs to them is computed once."""
-    return Panels(rows, order)
+    return Panels(rows, order, tallest)
+
+
+def fall(before: Float32, after: Float32, steps: int) -> Float64:
+    """What coefficients that fell from `before` to `after` add up to from `steps` further on, if they go on so.
+
+    Steps below 0 go back; how fast they fell there is taken to be at most a hundredth each.
+    """
+    ratio = np.clip(after / np.maximum(before, 1e-12), 1e-2, 0.99)
+    return np.asarray(2.0 * after * ratio**steps / (1.0 - ratio), np.float64)
 
 
 def _chebyshev(order: int) -> Float64:

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from hcnaf_runtime.plane import Distribution, Window
-from hcnaf_runtime.rows import Panels, panels
+from hcnaf_runtime.canvas import Canvas, column_sums, settle
+from hcnaf_runtime.rows import Panels, fall, panels
 from hcnaf_runtime.tiles import Tiles, batches
 
 Float32 = npt.NDArray[np.float32]
@@ -88,24 +88,6 @@ class Found:
             self.inside[which], self.outside[which] = np.add.reduceat(pieces[1:], first, axis=1)
 
 
-@dataclass(frozen=True)
-class Canvas:
-    """The maps that are filled: theta [B, P], their window, mass [., R, C] to be written, which of it is theirs
-    [B], and the most numbers in an intermediate of a run."""
-
-    flow: Distribution
-    theta: Float32
-    window: Window
-    mass: Float32
-    maps: Indices
-    chunk: int
-
-    @property
-    def rows(self) -> int:
-        """R."""
-        return len(self.window.y) - 1
-
-
 class TileRows:
     """J tiles of w columns, their `nodes`, what each column holds (`share`) and its cells may be wrong by (`goal`)
     [J, w], the shares of a column that its lower and its upper end may lose (`ends`) [2, J, w]; and what they came
@@ -165,7 +147,7 @@ class TileRows:
         """The least of ORDERS [J] that is enough as landmarks tell and pays for so many rows [J]; 0 for none."""
         order, goal = np.zeros(len(self.tile), np.intp), self.goal.min(axis=1)
         for each, most in reversed(ORDERS.items()):
-            predicted = np.minimum(_fall(before, after, (each - COARSE) // 2), 1.0) * self.share.max(axis=1)
+            predicted = np.minimum(fall(before, after, (each - COARSE) // 2), 1.0) * self.share.max(axis=1)
             worth = height >= WORTH * len(panels(self.canvas.rows, each).points)
             order[(predicted < most * goal) & worth] = each
         return order
@@ -200,7 +182,7 @@ class TileRows:
         for some in self._runs(np.full(len(which), len(y)), self.used[which]):
             j = which[some]
             mass, wrong = self._mass(j, np.broadcast_to(y, (len(j), len(y))))
-            off = _fall(*between.tails(mass), 1)
+            off = fall(*between.tails(mass), 1)
             fine = good[j] = off <= self.goal[j].min(axis=1) / 2.0
             if fine.any():
                 self._spread(j[fine], between.increments(mass[fine]), wrong[fine], off[fine])
@@ -208,11 +190,9 @@ class TileRows:
 
     def _spread(self, j: Indices, mass: Float32, wrong: Float32, off: Float64) -> None:
         """Interpolated `mass` [., rows, w] of tiles j, with errors `wrong` [., w] in x and `off` [.] in y."""
-        total, w = column_sums(mass), wrong.shape[1]
-        below = -np.minimum(mass.min(axis=(1, 2)), 0.0)
-        if below.any():  # the other rows give way: columns keep their mass
-            np.maximum(mass, 0.0, out=mass)
-            mass *= (np.maximum(total, 0.0) / np.maximum(column_sums(mass), 1e-30))[:, None]
+        w = wrong.shape[1]
+        total = column_sums(mass)
+        below = settle(mass, total)
         self.found.error[j, :w] = wrong + np.maximum(off, below)[:, None]
         self.found.inside[j, :w] = total
         self._put(j, mass, np.zeros_like(j), np.full_like(j, self.canvas.rows))
@@ -267,11 +247,6 @@ class TileRows:
             self.canvas.mass[own[owner]][low:high, at] = mass[i, : high - low, :n]
 
 
-def column_sums(mass: Float32) -> Float32:
-    """[J, w] from [J, rows, w]: as a product, several times as fast as a sum."""
-    return np.asarray((np.ones((1, mass.shape[1]), np.float32) @ mass)[:, 0])
-
-
 def _reach(points: Float64, held: Float32, end: Float64) -> Indices:
     """Rows [J, n] below which less than `end` [J, n] is held, from what is `held` [J, M, n] below `points` [M],
     ascending.
@@ -289,12 +264,3 @@ def _reach(points: Float64, held: Float32, end: Float64) -> Indices:
     further = np.maximum(place + np.clip(part, 0.0, 1.0) * step - 1.0, place)
     whole: Indices = np.floor(np.where(end > RESOLVED_TAIL, further, place) + 1e-6).astype(np.intp)
     return whole
-
-
-def _fall(before: Float32, after: Float32, steps: int) -> Float64:
-    """What coefficients that fell from `before` to `after` add up to from `steps` further on, if they go on so.
-
-    Steps below 0 go back; how fast they fell there is taken to be at most a hundredth each.
-    """
-    ratio = np.clip(after / np.maximum(before, 1e-12), 1e-2, 0.99)
-    return np.asarray(2.0 * after * ratio**steps / (1.0 - ratio), np.float64)

@@ -9,14 +9,16 @@ from hcnaf_runtime.flow import Flow
 
 POINTS: dict[str, Callable[..., int]] = {
     "cells": lambda theta, x, weight, doubt, y: x.size * y.shape[1],
-    "landmarks": lambda theta, x, y: x.size * y.shape[1],
+    "meshes": lambda theta, x, y: x.size * y.shape[1],
+    "checks": lambda theta, x, y: y.size,
     "F_1": lambda theta, x: x.size,
 }
-METHODS = {"cells": "cell_mass", "landmarks": "grid_cdf", "F_1": "marginal_cdf"}
+METHODS = {"cells": "cell_mass", "meshes": "grid_cdf", "checks": "conditional_cdf", "F_1": "marginal_cdf"}
 
 
 def per_map(call: Callable[[], Any], maps: int) -> dict[str, float]:
-    """Points evaluated for each of so many maps: of F_2 for cells and at landmarks, with padding, and of F_1."""
+    """Points evaluated for each of so many maps: of F_2 for cells, on meshes and at landmarks, and for checks,
+    with padding; and of F_1."""
     with counted() as found:
         call()
     return {name: number / maps for name, number in found.items()}

@@ -6,11 +6,18 @@ import pytest
 
 from hcnaf_runtime import Bundle, Forecaster, Scene
 
+
 # pytest runs in importlib mode, where a test's neighbours are not importable by themselves.
-_spec = importlib.util.spec_from_file_location("gaussian_bundle", Path(__file__).with_name("gaussian_bundle.py"))
-gaussian_bundle = importlib.util.module_from_spec(_spec)
-sys.modules["gaussian_bundle"] = gaussian_bundle
-_spec.loader.exec_module(gaussian_bundle)
+def _neighbour(name):
+    spec = importlib.util.spec_from_file_location(name, Path(__file__).with_name(f"{name}.py"))
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+gaussian_bundle = _neighbour("gaussian_bundle")
+_neighbour("analytic")
 
 
 @pytest.fixture(scope="session")

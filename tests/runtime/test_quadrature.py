@@ -67,3 +67,11 @@ def test_doubt_vanishes_for_polynomials_and_not_for_a_step(rule):
     assert abs(weights @ t ** (rule.order - 3)) < 1e-12
     for place in (0.31, 0.47, 0.78):
         assert abs(weights @ (t > place)) > 1e-3 / rule.panels
+
+
+@pytest.mark.parametrize("rule", [Rule(1, 5), Rule(4, 5)])
+def test_values_between_nodes(rule):
+    places = np.linspace(0, 1, 41)
+    nodes = rule.support[rule.nodes]
+    np.testing.assert_allclose(rule.at(places) @ nodes**4, places**4, atol=1e-12)
+    np.testing.assert_allclose(rule.at(nodes), np.eye(rule.size), atol=1e-12)

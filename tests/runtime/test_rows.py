@@ -63,3 +63,28 @@ def test_a_smooth_function_is_told_from_a_step():
     assert error > 0.05
     assert after > 1e-3
     assert after > 0.3 * before
+
+
+@pytest.mark.parametrize(("rows", "order"), [(200, 20), (201, 16)])
+def test_values_at_edges(rows, order):
+    panels = Panels(rows, order)
+    edges = np.array([0, 3, rows // 2, rows])
+    square = (panels.points / rows) ** 2
+    np.testing.assert_allclose(panels.at(edges) @ square, (edges / rows) ** 2, atol=1e-6)
+
+
+@pytest.mark.parametrize("rows", [200, 201])
+def test_increments_go_where_they_are_asked_to(rows):
+    panels = Panels(rows, 20)
+    steps = np.random.default_rng(0).random((2, len(panels.points) - 1, 3)).astype(np.float32)
+    wide = np.full((2, rows, 7), -1.0, np.float32)
+    found = panels.increments(steps, wide[..., 2:5])
+    assert np.shares_memory(found, wide)
+    np.testing.assert_array_equal(wide[..., 2:5], panels.increments(steps))
+    assert (wide[..., [0, 1, 5, 6]] == -1).all()
+
+
+def test_panels_of_other_heights():
+    assert Panels(200, 32, 128).count == 2
+    assert Panels(200, 32).count == 4
+    assert len(Panels(200, 32, 128).points) == 65

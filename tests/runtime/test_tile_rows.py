@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 
+from hcnaf_runtime.canvas import column_sums
 from hcnaf_runtime.cells import _shares
 from hcnaf_runtime.columns import _ends, _kept
 from hcnaf_runtime.plane import Window
-from hcnaf_runtime.tile_rows import Nodes, TileRows, column_sums
+from hcnaf_runtime.tile_rows import Nodes, TileRows
 
 WINDOW = Window(np.arange(5, dtype=np.float32), np.arange(4, dtype=np.float32))
 
