@@ -51,6 +51,14 @@ class Setting:
         return latency(lambda _: call(), lambda: None, self.seconds, min(least, self.least)).to_dict()
 
 
+    def beside(self, density: Density, peer: Callable[[], Any], least: int = 10) -> Json:
+        """Latency of a peer, and with it the seconds of our dense map, measured right before and after: a machine is
+        not as fast in one minute as in the next."""
+        maps = partial(density.forecaster.pom, density.condition(MAPS), window())
+        before, found, after = self.time(maps), self.time(peer, least), self.time(maps)
+        return found | {"ours": (before["median"] + after["median"]) / (2 * MAPS)}
+
+
 def now() -> str:
     """Date and time, ISO 8601."""
     return datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
@@ -117,12 +125,12 @@ def _pytorch(setting: Setting, density: Density) -> Json:
             whole = partial(_parts, form, call, density.spec, x)
             with torch.no_grad():
                 # The slow ones take seconds: two calls after the warm-up say enough.
-                found[f"{form}, {mode}"] = setting.time(whole, least=2 if form == "log-sum-exp" else 5)
+                least = 2 if form == "log-sum-exp" else 5
+                found[f"{form}, {mode}"] = setting.beside(density, whole, least)
     each = partial(published.log_prob_each, density.spec, density.theta)
     with torch.no_grad():
-        found["log-sum-exp, weights per point"] = setting.time(
-            partial(_parts, "log-sum-exp", each, density.spec, x), 1
-        )
+        whole = partial(_parts, "log-sum-exp", each, density.spec, x)
+        found["log-sum-exp, weights per point"] = setting.beside(density, whole, 1)
         found["agreement"] = _agreement(density, x[::97])
     return found
 
@@ -142,7 +150,7 @@ def _agreement(density: Density, x: torch.Tensor) -> float:
 
 def measure_libraries(setting: Setting) -> Json:
     """log_prob of other libraries' flows at 40,000 points over [-5, 5]^2."""
-    x = torch.from_numpy(centres() / 10.0)
+    x, density = torch.from_numpy(centres() / 10.0), setting.density(3, 20)
     found: Json = {}
     for name, make in libraries.FLOWS.items():
         try:
@@ -151,7 +159,7 @@ def measure_libraries(setting: Setting) -> Json:
             found[name] = {"absent": e.name}
             continue
         with torch.no_grad():  # zuko's NAF turns gradients on for its own Jacobian
-            found[name] = setting.time(partial(log_prob, x), least=5)
+            found[name] = setting.beside(density, partial(log_prob, x), least=5)
     return found
 
 

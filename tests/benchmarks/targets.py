@@ -50,13 +50,17 @@ def dense(results: Json, H: int) -> float:
     return float(case[f"dense x{case['maps']}"]["median"]) / int(case["maps"])
 
 
+def times_ours(case: Json) -> float:
+    """How many times as long as our dense map, measured around it, a peer takes."""
+    return float(case["median"]) / float(case["ours"])
+
+
 def _published(results: Json, H: int, form: str = EAGER) -> float:
-    return float(results["published"][f"H={H}"][form]["median"]) / dense(results, H)
+    return times_ours(results["published"][f"H={H}"][form])
 
 
 def _peer(results: Json, names: tuple[str, ...]) -> float:
-    times = [results["libraries"][name]["median"] for name in names if "median" in results["libraries"][name]]
-    return float(min(times)) / dense(results, 20)
+    return min(times_ours(results["libraries"][name]) for name in names if "median" in results["libraries"][name])
 
 
 def _cases(results: Json, section: str, containing: str = "") -> list[Json]:
