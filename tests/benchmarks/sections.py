@@ -50,10 +50,11 @@ class Setting:
         """Latency of a call without arguments."""
         return latency(lambda _: call(), lambda: None, self.seconds, min(least, self.least)).to_dict()
 
-
     def beside(self, density: Density, peer: Callable[[], Any], least: int = 10) -> Json:
-        """Latency of a peer, and with it the seconds of our dense map, measured right before and after: a machine is
-        not as fast in one minute as in the next."""
+        """Latency of a peer, and with it the seconds of our dense map, measured right before and after.
+
+        A machine is not as fast in one minute as in the next.
+        """
         maps = partial(density.forecaster.pom, density.condition(MAPS), window())
         before, found, after = self.time(maps), self.time(peer, least), self.time(maps)
         return found | {"ours": (before["median"] + after["median"]) / (2 * MAPS)}
