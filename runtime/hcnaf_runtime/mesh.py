@@ -12,14 +12,14 @@ import numpy.typing as npt
 
 from hcnaf_runtime.products import product
 from hcnaf_runtime.quadrature import Rule
-from hcnaf_runtime.rows import Panels, panels
+from hcnaf_runtime.rows import Panels, how_many, panels
 
 Float32 = npt.NDArray[np.float32]
 Float64 = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.intp]
 
-WIDEST, MOST = 128, 8
-"""A panel has at most so many columns or rows, unless there were more than so many panels."""
+WIDEST = 128
+"""A panel has at most so many columns or rows, unless there were too many panels."""
 
 WORTH = 2
 """A mesh pays with so many times as many columns as nodes, and rows as points, or more."""
@@ -43,7 +43,7 @@ class Mesh:
     @cached_property
     def rule(self) -> Rule:
         """The panels of columns, with S nodes in all."""
-        return Rule(min(-(-self.columns // WIDEST), MOST), self.nodes)
+        return Rule(how_many(self.columns, WIDEST), self.nodes)
 
     @property
     def between(self) -> Panels:

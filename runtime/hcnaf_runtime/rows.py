@@ -32,7 +32,7 @@ class Panels:
     @property
     def count(self) -> int:
         """How many panels there are."""
-        return min(-(-self.rows // self.tallest), MOST)
+        return how_many(self.rows, self.tallest)
 
     @cached_property
     def points(self) -> Float64:
@@ -98,6 +98,11 @@ class Panels:
         """[4, order]: the last four Chebyshev coefficients from the increments between a panel's points."""
         values = np.polynomial.chebyshev.chebvander(2.0 * _chebyshev(self.order) - 1.0, self.order)
         return (np.linalg.inv(values)[-4:] @ _sums(self.order)).astype(np.float32)
+
+
+def how_many(size: int, largest: int) -> int:
+    """How many panels `size` rows or columns are cut into."""
+    return min(-(-size // largest), MOST)
 
 
 @lru_cache(maxsize=16)
