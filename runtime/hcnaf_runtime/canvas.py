@@ -11,6 +11,10 @@ Float32 = npt.NDArray[np.float32]
 Indices = npt.NDArray[np.intp]
 
 
+ROUNDED = 5e-7
+"""What float32 rounds off the sum of a map."""
+
+
 @dataclass(frozen=True)
 class Canvas:
     """The maps that are filled: theta [B, P], their window, mass [., R, C] to be written, which of it is theirs
@@ -34,14 +38,17 @@ def column_sums(mass: Float32) -> Float32:
     return np.asarray((np.ones((1, mass.shape[-2]), np.float32) @ mass)[..., 0, :])
 
 
-def settle(mass: Float32, total: Float32) -> Float32:
-    """Take out of `mass` [..., rows, w] what is below 0; the other rows give way, so that columns keep their sums,
-    `total` [..., w].
+def settle(mass: Float32, total: Float32, out: Float32) -> Float32:
+    """`mass` [..., rows, w] without what is below 0, in `out`, which may be `mass`. Where that is more than
+    rounding in a map the other rows give way, so that columns keep their sums, `total` [..., w].
 
     Returns how far below 0 it was [...].
     """
-    below = -np.minimum(mass.min(axis=(-2, -1)), 0.0)
-    if below.any():
-        np.maximum(mass, 0.0, out=mass)
-        mass *= (np.maximum(total, 0.0) / np.maximum(column_sums(mass), 1e-30))[..., None, :]
+    below = np.maximum(-mass.min(axis=(-2, -1)), 0.0)
+    np.maximum(mass, 0.0, out=out)
+    kept = column_sums(out)
+    much = (kept - total).sum(axis=-1) > ROUNDED
+    if much.any():
+        share = np.maximum(total, 0.0) / np.maximum(kept, 1e-30)
+        out *= np.where(much[..., None], share, np.float32(1.0))[..., None, :]
     return np.asarray(below)

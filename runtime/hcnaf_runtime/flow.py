@@ -18,6 +18,11 @@ from hcnaf_runtime.workers import Workers
 Float32 = npt.NDArray[np.float32]
 T = TypeVar("T")
 
+_NEEDED: tuple[GraphName, ...] = ("flow", "marginal_cdf", "conditional_cdf", "cell_mass")
+
+_APART: tuple[GraphName, ...] = ("cell_mass",)
+"""Graphs that every lane has to itself (see `session.Settings`): what runs of the others take is small."""
+
 PART = 1 << 17
 """Queries are cut into parts of about so many numbers in the widest intermediate."""
 
@@ -43,8 +48,15 @@ class Flow(Distribution):
 
     def __init__(self, bundle: Bundle, settings: Settings) -> None:
         self._bundle = bundle
-        self._settings = replace(settings, threads=1)
+        self._lanes = [replace(settings, threads=1, lane=k) for k in range(settings.threads)]
         self._workers = Workers(settings.threads)
+
+    def load(self) -> None:
+        """Load the graphs that maps and densities need, for every thread."""
+        for graph in _NEEDED:
+            if graph in self._bundle.manifest.graphs:
+                for settings in self._lanes if graph in _APART else self._lanes[:1]:
+                    self._bundle.session(graph, settings)
 
     @property
     def dims(self) -> int:
@@ -142,7 +154,8 @@ class Flow(Distribution):
         return np.concatenate(rows)
 
     def _run(self, graph: GraphName, outputs: list[str], **feeds: Float32) -> list[Float32]:
-        session = self._bundle.session(graph, self._settings)
+        lane = self._workers.lane if graph in _APART else 0
+        session = self._bundle.session(graph, self._lanes[lane])
         return session.run(outputs, {name: np.ascontiguousarray(value) for name, value in feeds.items()})
 
 

@@ -69,6 +69,7 @@ class Forecaster:
 
         Give a scene of the usual size: what onnxruntime allocates for it is kept and used again.
         """
+        self.flow.load()
         if self.flow.dims == 2:
             self.pom(scene, horizons=horizons)
         self.log_prob(scene, np.zeros((1, self.flow.dims), np.float32), horizons)

@@ -1,8 +1,8 @@
 """Interpolation along y: where F_2 is smooth a few points tell all rows.
 
 The rows of a window are cut into a few panels. In each, a function of y is known at Chebyshev points, the panel's
-ends among them, and interpolated by a polynomial. Panels share their ends, so that increments between rows
-telescope whatever the interpolation does.
+ends among them, and interpolated by a polynomial (in y, or in what spaces the points more evenly: `spacing`).
+Panels share their ends, so that increments between rows telescope whatever the interpolation does.
 """
 
 from dataclasses import dataclass
@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hcnaf_runtime.products import product
+from hcnaf_runtime.spacing import crowded, spaced
 
 Float32 = npt.NDArray[np.float32]
 Float64 = npt.NDArray[np.float64]
@@ -23,11 +24,12 @@ TALLEST, MOST = 64, 8
 
 @dataclass(frozen=True)
 class Panels:
-    """`rows` rows in panels of equal height, at most `tallest`, each with `order` + 1 points."""
+    """`rows` rows in panels of equal height, at most `tallest`, with `order` + 1 points each, `even`ly spaced."""
 
     rows: int
     order: int
     tallest: int = TALLEST
+    even: float = 0.0
 
     @property
     def count(self) -> int:
@@ -37,7 +39,7 @@ class Panels:
     @cached_property
     def points(self) -> Float64:
         """[count order + 1]: where the function is known, ascending, in rows from the lowest edge."""
-        inner = _chebyshev(self.order)[:-1]
+        inner = spaced(_chebyshev(self.order)[:-1], self.even)
         starts = np.arange(self.count)[:, None]
         return np.append((starts + inner).ravel(), float(self.count)) * (self.rows / self.count)
 
@@ -80,7 +82,7 @@ class Panels:
         place: Float64 = np.arange(self.rows + 1, dtype=np.float64) * (self.count / self.rows)
         panel = np.minimum(place.astype(np.intp), self.count - 1)
         within: Float64 = place - panel
-        own = _interpolation(_chebyshev(self.order), within) @ _sums(self.order)
+        own = self._from_sums(within)
         at_edges = np.repeat(np.arange(self.count) < panel[:, None], self.order, axis=1).astype(np.float64)
         for p in range(self.count):
             at_edges[panel == p, p * self.order : (p + 1) * self.order] = own[panel == p]
@@ -90,8 +92,14 @@ class Panels:
     def _from_own_gaps(self) -> Float32:
         """[rows / count, order]: increments of a panel's rows from those between its points, if rows are divided
         equally."""
-        own = _interpolation(_chebyshev(self.order), np.linspace(0.0, 1.0, self.rows // self.count + 1))
-        return (np.diff(own, axis=0) @ _sums(self.order)).astype(np.float32)
+        own = self._from_sums(np.linspace(0.0, 1.0, self.rows // self.count + 1))
+        return np.diff(own, axis=0).astype(np.float32)
+
+    def _from_sums(self, places: Float64) -> Float64:
+        """[n, order]: values at `places` [n] in a panel, from 0 at its lower end, out of increments between its
+        points."""
+        at: Float64 = _interpolation(_chebyshev(self.order), crowded(places, self.even)) @ _sums(self.order)
+        return at
 
     @cached_property
     def _modes(self) -> Float32:
@@ -106,17 +114,17 @@ def how_many(size: int, largest: int) -> int:
 
 
 @lru_cache(maxsize=16)
-def panels(rows: int, order: int, tallest: int = TALLEST) -> Panels:
+def panels(rows: int, order: int, tallest: int = TALLEST, even: float = 0.0) -> Panels:
     """The panels of so many rows; what belongs to them is computed once."""
-    return Panels(rows, order, tallest)
+    return Panels(rows, order, tallest, even)
 
 
-def fall(before: Float32, after: Float32, steps: int) -> Float64:
+def fall(before: Float32, after: Float32, steps: int, least: float = 1e-2) -> Float64:
     """What coefficients that fell from `before` to `after` add up to from `steps` further on, if they go on so.
 
-    Steps below 0 go back; how fast they fell there is taken to be at most a hundredth each.
+    Steps below 0 go back. However fast they fell, each is taken to be at least a `least` share of the one before.
     """
-    ratio = np.clip(after / np.maximum(before, 1e-12), 1e-2, 0.99)
+    ratio = np.clip(after / np.maximum(before, 1e-12), least, 0.99)
     return np.asarray(2.0 * after * ratio**steps / (1.0 - ratio), np.float64)
 
 

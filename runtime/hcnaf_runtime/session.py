@@ -37,11 +37,15 @@ class Settings:
     side by side (see `workers`). With `spinning` they wait for the next run in a busy loop: the lowest latency,
     for a CPU that has nothing else to do. `flush_denormals` makes numbers below 1e-38 zero, in the graph and from
     then on in the thread that loaded it; the flow's graphs make none.
+
+    Threads that run graphs side by side may have a `lane` each. In lane 0 graphs share one arena; in any other
+    each has its own: memory that goes to and fro between threads leaves the cache of one for that of the other.
     """
 
     threads: int
     spinning: bool = False
     flush_denormals: bool = False
+    lane: int = 0
 
 
 class Session:
@@ -89,14 +93,15 @@ def _options(onnxruntime: Any, settings: Settings) -> Any:
     options.add_session_config_entry("session.intra_op.allow_spinning", str(int(settings.spinning)))
     if settings.flush_denormals:
         options.add_session_config_entry("session.set_denormal_as_zero", "1")
-    _share_arena(onnxruntime)
-    options.add_session_config_entry("session.use_env_allocators", "1")
+    if settings.lane == 0:
+        _share_arena(onnxruntime)
+        options.add_session_config_entry("session.use_env_allocators", "1")
     return options
 
 
 @cache
 def _share_arena(onnxruntime: Any) -> None:
-    """One arena for all graphs of the process, where each would keep what its largest run took.
+    """One arena for all graphs of a lane, where each would keep what its largest run took.
 
     Only sessions that ask for it use it. If the program has shared an arena of its own, that one serves.
     """

@@ -25,11 +25,9 @@ Float64 = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.intp]
 Mask = npt.NDArray[np.bool_]
 
-MESHES = (24, 32), (32, 44), (48, 48)
-"""Nodes of a panel of columns and order of a panel of rows, tried in turn."""
-
-PROMISING = 5e-5
-"""Tried where F_1 at the columns' edges is as smooth as the polynomials of the first mesh to within this."""
+MESHES = (256, 32, 47, 0.99), (128, 36, 72, 0.97), (128, 48, 96, 0.95)
+"""The most columns of a panel, its nodes, the order of a panel of rows, and how evenly both are spaced; tried in
+turn. Products take as long with up to 16 nodes more as with the next multiple of 16."""
 
 AROUND, ALONE = 3, 2.0
 """Tried where no column holds more or less than a polynomial through so many others on either side says, by more
@@ -44,8 +42,15 @@ FAR = 10.0
 SEEN = 1.5
 """The worst cell is taken to be wrong by so many times as much as the worst of those that are checked."""
 
-GOLDEN = 0.6180339887498949
-"""In the next column the cell that is checked is by so much of the column's rise further up, modulo 1."""
+FALLS = 0.5
+"""Coefficients in y are not taken to fall any faster: the last may be small by chance."""
+
+GOLDEN, SILVER = 0.6180339887498949, 0.4142135623730951
+"""In the next column the cell that is checked is by so much of the column's rise further up, modulo 1, and by so
+much of what is between two LANDMARKS."""
+
+LANDMARKS = 4
+"""Every so many-th point tells where columns rise."""
 
 TOGETHER = 1 << 18
 """Cells that are interpolated together: with fewer threads wait for Python's lock, with more for memory."""
@@ -79,19 +84,18 @@ def fill(canvas: Canvas, around: Float64, goal: Float64) -> Iterator[Filled]:
     side [B, C + 1 + 2 AROUND], and what cells may be wrong by [B, C]."""
     meshes = [each for orders in MESHES if (each := mesh(goal.shape[1], canvas.rows, *orders)).worth]
     if meshes:
-        left = _promising(around, goal, meshes[0])
+        left = _promising(around, goal)
         for each in meshes:
             if left.any():
                 yield from Smooth(canvas, each, around, goal).fill(left)
 
 
-def _promising(around: Float64, goal: Float64, coarse: Mesh) -> Mask:
+def _promising(around: Float64, goal: Float64) -> Mask:
     """[B]: which maps to try, by F_1."""
-    cdf = around[:, AROUND:-AROUND]
-    found = (np.diff(cdf, axis=1) > HOLDS).mean(axis=1) > WIDE
+    found = (np.diff(around[:, AROUND:-AROUND], axis=1) > HOLDS).mean(axis=1) > WIDE
     if found.any():
         alone = np.abs(np.diff(around, 2 * AROUND + 1, axis=1)) / math.comb(2 * AROUND, AROUND)
-        found &= (alone < ALONE * goal).all(axis=1) & (coarse.misfit(cdf) < PROMISING)
+        found &= (alone < ALONE * goal).all(axis=1)
     return np.asarray(found)
 
 
@@ -107,19 +111,31 @@ class Smooth:
     def fill(self, left: Mask) -> Iterator[Filled]:
         """Fill those of the maps that are `left` [B] and smooth. Neither they are left then nor those that are far
         from smooth. Where all maps looked at first fail the mesh is taken to be too coarse for the others."""
+        count = 0
+        for group in self._groups(np.flatnonzero(left)):
+            tried = [self._evaluated(some) for some in _cut(group, self.canvas.chunk // self._size)]
+            fine = _joined([each[self._near(each.maps, each.error[:, None], left)] for each in tried])
+            if len(fine.maps):
+                filled = self._checked(fine, left)
+                left[filled.maps] = False
+                count += len(filled.maps)
+                yield filled
+            if not count:
+                return
+
+    def _groups(self, maps: Indices) -> list[Indices]:
+        """`maps` in parts that are checked and put together: the last, of a forecast the furthest ahead and
+        smoothest, before all others, unless one graph run takes all."""
         each = max(self.mesh.rows, self.mesh.rule.size) * self.mesh.columns
-        for group in _cut(np.flatnonzero(left), self.canvas.chunk // each):
-            fine = []
-            for some in _cut(group, self.canvas.chunk // self._size):
-                tried = self._evaluated(some)
-                missed = tried.error / self.goal[some].min(axis=1)
-                left[some] = missed <= FAR
-                fine.append(tried[missed <= 1.0])
-                if not len(fine[0].maps):
-                    return
-            filled = self._checked(_joined(fine))
-            left[filled.maps] = False
-            yield filled
+        rest = len(maps) - int(len(maps) * self._size > self.canvas.chunk)
+        return [*_cut(maps[rest:], 1), *_cut(maps[:rest], self.canvas.chunk // each)]
+
+    def _near(self, maps: Indices, error: Float64, left: Mask) -> Mask:
+        """Which of the `maps` are within their goal by this `error` [n, 1 or C]. Those far from it are not
+        `left`."""
+        missed = (error / self.goal[maps]).max(axis=1)
+        left[maps] = missed <= FAR
+        return np.asarray(missed <= 1.0)
 
     @property
     def _size(self) -> int:
@@ -134,16 +150,17 @@ class Smooth:
         found = [self.canvas.flow.grid_cdf(theta, np.broadcast_to(x, (len(maps), len(x))), y) for x in parts]
         cdf = np.concatenate(found, axis=2) if len(found) > 1 else found[0]
         mass = product(np.diff(cdf, axis=1), self.mesh.weights(self.around[maps, AROUND - 1 : 1 - AROUND]))
-        return Tried(maps, cdf, mass, SEEN * fall(*between.tails(mass), 1))
+        return Tried(maps, cdf, mass, SEEN * fall(*between.tails(mass), 1, FALLS))
 
-    def _checked(self, tried: Tried) -> Filled:
+    def _checked(self, tried: Tried, left: Mask) -> Filled:
         """Fill the maps that pass the checks."""
         error = np.maximum(tried.error[:, None], SEEN * self._missed(tried.maps, tried.cdf))
-        good = (error <= self.goal[tried.maps]).all(axis=1)
+        good = self._near(tried.maps, error, left)
         maps, mass, error = tried.maps[good], tried.mass[good], error[good]
         inside = column_sums(mass)
-        below = self._put(self.canvas.maps[maps], mass, inside)
-        return Filled(maps, np.maximum(error, below[:, None]), inside)
+        error = np.maximum(error, self._put(self.canvas.maps[maps], mass, inside)[:, None])
+        done = np.flatnonzero((error <= self.goal[maps]).all(axis=1))
+        return Filled(maps[done], error[done], inside[done])
 
     def _put(self, places: Indices, mass: Float32, inside: Float32) -> Float32:
         """Put all cells, from what columns hold between points [n, E - 1, C] and in all [n, C], in `places` [n] of
@@ -152,25 +169,36 @@ class Smooth:
         R, C = self.mesh.rows, self.mesh.columns
         if R * C > TOGETHER:
             for i, place in enumerate(places):
-                below[i] = settle(between.increments(mass[i], into[place]), inside[i])
+                below[i] = settle(between.increments(mass[i], into[place]), inside[i], into[place])
             return below
         for some in _cut(np.arange(len(places)), TOGETHER // (R * C)):
             cells = between.increments(mass[some], _scratch.of(len(some), R, C))
-            below[some] = settle(cells, inside[some])
-            into[places[some]] = cells
+            for i, own in zip(some.tolist(), cells, strict=True):
+                below[i] = settle(own, inside[i], into[places[i]])
         return below
 
     def _missed(self, maps: Indices, cdf: Float32) -> Float64:
         """[n, C]: how far the cell that is checked in each column is off, from F_2 on the mesh."""
-        low, high = self.mesh.at_candidates(cdf)
-        which = _rising(low)
-        known = np.take_along_axis(high - low, which[:, None], axis=1)[:, 0]
+        middles = self.mesh.middles(cdf)
+        rows = self._rising(middles)
         x, y = self.canvas.window.x, self.canvas.window.y
-        middle = np.broadcast_to((x[1:] + x[:-1]) / 2.0, which.shape)
-        edges = y[self.mesh.candidates[which][..., None] + [0, 1]]
-        found = self.canvas.flow.conditional_cdf(self.canvas.theta[maps], middle, edges)
-        off = np.abs(np.diff(found, axis=2)[..., 0] - known)
+        middle = np.broadcast_to((x[1:] + x[:-1]) / 2.0, rows.shape)
+        found = self.canvas.flow.conditional_cdf(self.canvas.theta[maps], middle, y[rows[..., None] + [0, 1]])
+        off = np.abs(np.diff(found, axis=2)[..., 0] - self.mesh.rises(middles, rows))
         return np.asarray(off * np.diff(self.around[maps, AROUND:-AROUND], axis=1))
+
+    def _rising(self, middles: Float32) -> Indices:
+        """[n, C]: a row of each column, by F_2 at the points in its middle [n, C, E]: after a share of its rise
+        that is a different one in each column."""
+        points = self.mesh.between.points[::LANDMARKS]
+        known = np.ascontiguousarray(middles[..., ::LANDMARKS].swapaxes(1, 2))
+        column = np.arange(known.shape[2])
+        level = (column * GOLDEN % 1.0).astype(np.float32)
+        low, high = known[:, :1], known[:, -1:]
+        passed = np.count_nonzero(known[:, 1:-1] <= low + (high - low) * level, axis=1)
+        further = column * SILVER % 1.0
+        place = points[passed] + (points[passed + 1] - points[passed]) * further
+        return np.asarray(np.minimum(place, self.mesh.rows - 1), np.intp)
 
 
 class _Scratch(threading.local):
@@ -198,12 +226,3 @@ def _joined(parts: list[Tried]) -> Tried:
     if len(parts) == 1:
         return parts[0]
     return Tried(*(np.concatenate([getattr(p, f) for p in parts]) for f in ("maps", "cdf", "mass", "error")))
-
-
-def _rising(known: Float32) -> Indices:
-    """[n, C]: among the K values of F_2 `known` in each column [n, K, C], the last before some share of its rise,
-    a different one in each column."""
-    level = (np.arange(known.shape[2]) * GOLDEN % 1.0).astype(np.float32)
-    low, high = known[:, :1], known[:, -1:]
-    passed = np.count_nonzero(known <= low + (high - low) * level, axis=1)
-    return np.asarray(np.maximum(passed - 1, 0), np.intp)

@@ -192,7 +192,7 @@ class TileRows:
         """Interpolated `mass` [., rows, w] of tiles j, with errors `wrong` [., w] in x and `off` [.] in y."""
         w = wrong.shape[1]
         total = column_sums(mass)
-        below = settle(mass, total)
+        below = settle(mass, total, mass)
         self.found.error[j, :w] = wrong + np.maximum(off, below)[:, None]
         self.found.inside[j, :w] = total
         self._put(j, mass, np.zeros_like(j), np.full_like(j, self.canvas.rows))

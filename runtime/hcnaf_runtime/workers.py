@@ -4,6 +4,7 @@ The flow's graphs are small: a second thread inside a run waits and is waited fo
 side by side need no such agreement, and give the same numbers however many threads there are.
 """
 
+import itertools
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -17,8 +18,18 @@ class Workers:
 
     def __init__(self, threads: int) -> None:
         self.threads = threads
-        self._pool = ThreadPoolExecutor(threads - 1, "hcnaf") if threads > 1 else None
-        self._here = threading.local()
+        here, lanes = threading.local(), itertools.count(1)
+
+        def begin() -> None:  # holds on to no Workers: they end when nobody else does
+            here.lane = next(lanes)
+
+        self._pool = ThreadPoolExecutor(threads - 1, "hcnaf", begin) if threads > 1 else None
+        self._here = here
+
+    @property
+    def lane(self) -> int:
+        """Which thread this is: 0 for a caller's own, 1 to `threads` - 1 for the others."""
+        return getattr(self._here, "lane", 0)
 
     @property
     def busy(self) -> bool:

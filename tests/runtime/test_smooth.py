@@ -103,6 +103,13 @@ def test_what_is_between_the_points_is_found(name, filled):
     assert np.abs(found.mass[0] - truth).max() < (3e-5 if name == "a jerk on an edge" else 1.5e-5)
 
 
+@pytest.mark.parametrize("y", np.random.default_rng(0).uniform(-30, 30, 8))
+def test_thin_lines_are_found_wherever_they_are(y):
+    """No row is one that is never checked, and no point of a mesh need be near."""
+    flow, where = Mixture([(0.99, 0, 0, 20, 15, 0), (0.01, 0, y, 20, 0.1, 0)]), window()
+    assert np.abs(maps(flow, where).mass[0] - flow.truth(where)).max() < 2e-5
+
+
 def test_smooth_and_other_maps_side_by_side(filled):
     """A share with both: each map gets what it gets alone."""
 

@@ -1,5 +1,6 @@
 """Work shared out to threads: all of it done once, failures raised, no waiting for each other."""
 
+import gc
 import threading
 
 import pytest
@@ -52,6 +53,39 @@ def test_work_inside_of_work_does_not_wait(threads):
     workers.each(work, range(4))
     assert sorted(inner) == sorted([0, 1, 2, 3] * 3)
     assert not workers.busy
+
+
+@pytest.mark.parametrize("threads", [1, 2, 4])
+def test_every_thread_has_a_lane_of_its_own(threads):
+    workers, lanes = Workers(threads), {}
+    meeting = threading.Barrier(threads, timeout=10.0)
+
+    def work(_):
+        meeting.wait()  # each thread takes one item
+        lanes[threading.get_ident()] = workers.lane
+
+    for _ in range(3):
+        workers.each(work, range(threads))
+    assert sorted(lanes.values()) == list(range(threads))
+    assert lanes[threading.get_ident()] == workers.lane == 0
+
+
+def test_threads_end_with_their_workers():
+    workers, seen = Workers(3), set()
+    meeting = threading.Barrier(3, timeout=10.0)
+
+    def work(_):
+        meeting.wait()
+        seen.add(threading.current_thread())
+
+    workers.each(work, range(3))
+    others = seen - {threading.current_thread()}
+    assert len(others) == 2
+    del workers
+    gc.collect()
+    for thread in others:
+        thread.join(10.0)
+        assert not thread.is_alive()
 
 
 def test_nothing_to_do():
