@@ -14,7 +14,7 @@ import torch
 from onnx_ir.passes.common import CommonSubexpressionEliminationPass
 from onnxscript.optimizer import fold_constants, remove_unused_nodes
 from onnxscript.rewriter import RewriteRuleSet, rewrite
-from onnxscript.rewriter.rules.common import materialize_reshape_shape_rule
+from onnxscript.rewriter.rules.common import materialize_reshape_shape_rule, no_op_transpose_rule
 from torch import Tensor
 from torch.export import Dim
 
@@ -84,7 +84,7 @@ def example(tensor: Contract) -> Tensor:
 
 def _tidy(model: Any) -> None:
     """Fold constants and what shapes are computed from, merge what is computed twice, drop what is not used."""
-    rewrite(model, RewriteRuleSet([materialize_reshape_shape_rule]))
+    rewrite(model, RewriteRuleSet([materialize_reshape_shape_rule, no_op_transpose_rule]))
     fold_constants(model)
     CommonSubexpressionEliminationPass()(model)
     remove_unused_nodes(model)

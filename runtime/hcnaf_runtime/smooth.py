@@ -27,7 +27,7 @@ Mask = npt.NDArray[np.bool_]
 
 MESHES = (256, 32, 47, 0.99), (128, 36, 72, 0.97), (128, 48, 96, 0.95)
 """The most columns of a panel, its nodes, the order of a panel of rows, and how evenly both are spaced; tried in
-turn. Products take as long with up to 16 nodes more as with the next multiple of 16."""
+turn. Products take as long as with the next multiple of 16 nodes."""
 
 AROUND, ALONE = 3, 2.0
 """Tried where no column holds more or less than a polynomial through so many others on either side says, by more

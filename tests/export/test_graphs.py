@@ -4,7 +4,7 @@ import onnxruntime
 import pytest
 import torch
 
-from hcnaf_export.graphs import graphs, weighed_fraction
+from hcnaf_export.graphs import LOG_ERF_FROM, graphs, shipped_log_interval, weighed_fraction
 from hcnaf_export.onnx_file import EXAMPLE_SIZES, write_onnx
 from hcnaf_export.parity import compare_graph, contract, draw, run_torch
 from hcnaf_export.probes import SCENES, SceneSetting, flow_cases, scene
@@ -197,6 +197,27 @@ def test_cells_are_by_erf_only_where_that_is_accurate_enough():
     heavy, light = (weighed_fraction(torch.full((1, 1, 1), share))(z) for share in (1.0, 0.01))
     torch.testing.assert_close(heavy, planar.stable_fraction(z), atol=1e-7, rtol=0.0)
     assert 1e-6 < (light - planar.stable_fraction(z.double())).abs().max() < 5e-5
+
+
+@pytest.mark.parametrize(("held", "last", "most"), [(1.02, 2.0, 2e-5), (0.98, -3.0, 1e-6)])
+def test_logarithms_are_by_erf_only_where_that_is_accurate_enough(held, last, most):
+    """Intervals that hold a little more than erf does for, anywhere, and a little less, out in the tail."""
+    a = torch.linspace(-6.0, last, 400).double()
+    b = torch.special.ndtri(torch.special.ndtr(a) + held * LOG_ERF_FROM).float()
+    found = shipped_log_interval(a.float(), b).double()
+    expected = torch.log(torch.special.ndtr(b.double()) - torch.special.ndtr(a.float().double()))
+    assert (found - expected).abs().max() < most
+
+
+def test_maps_with_close_limits_do_not_slow_the_others_down():
+    """Of maps side by side each gets what it gets alone: erf for all but those that it does not do for."""
+    share = torch.tensor([0.01, 1.0, 0.01, 1.0])[:, None, None]
+    z = torch.cat([torch.linspace(2.0, 2.05, 40), torch.tensor([2.0, 2.05])])[None, :, None].expand(4, -1, -1)
+    together = weighed_fraction(share)(z)
+    alone = torch.cat([weighed_fraction(share[b : b + 1])(z[b : b + 1]) for b in range(4)])
+    torch.testing.assert_close(together, alone, atol=0.0, rtol=0.0)
+    torch.testing.assert_close(together[1::2], planar.stable_fraction(z[1::2]), atol=0.0, rtol=0.0)
+    assert (together[::2] - together[1::2]).abs().max() > 1e-7
 
 
 def test_examples_are_never_of_size_one_and_tell_sizes_apart():
