@@ -11,12 +11,14 @@ import sys
 import time
 import warnings
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import torch
 
 from tests.benchmarks import plot, report, sections
 from tests.benchmarks.density import source
+from tests.benchmarks.quiet import Quiet, speed
 from tests.benchmarks.sections import Json, Setting
 from tests.benchmarks.sweep import export_flows, measure_sweep
 
@@ -51,17 +53,19 @@ def main() -> int:
     asked = [] if args.render else args.only
     if asked or "machine" not in results:
         results["machine"] = sections.facts(setting)
+    moment = Quiet(partial(speed, args.threads), results.get("fastest", 0.0), args.patience)
     for name in asked:
         start = time.perf_counter()
         try:
-            results[name] = SECTIONS[name](setting)
+            results[name], pace = moment.measure(partial(SECTIONS[name], setting))
             results.setdefault("measured", {})[name] = sections.now()
+            results.setdefault("pace", {})[name], results["fastest"] = pace, moment.fastest
         except Exception as e:  # the other sections are worth having
             failed.append(name)
             print(f"{name}: failed: {type(e).__name__}: {e}", file=sys.stderr)
             continue
         _write(results, args.out)
-        print(f"{name}: {time.perf_counter() - start:.0f} s", file=sys.stderr)
+        print(f"{name}: {time.perf_counter() - start:.0f} s, pace {pace:.2f}", file=sys.stderr)
     _write(results, args.out)
     print(report.targets(results))
     return 1 if failed else 0
@@ -77,6 +81,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--seconds", type=float, default=1.0, help="per fast case [1]")
     parser.add_argument("--least", type=int, default=10, help="calls per case, whatever the time [10]")
     parser.add_argument("--scenes", type=int, default=10_000, help="served in `memory` [10000]")
+    parser.add_argument("--patience", type=float, default=0.0, help="seconds to spend on quieter moments [0]")
     parser.add_argument("--render", action="store_true", help="only write the tables and the picture again")
     return parser.parse_args()
 

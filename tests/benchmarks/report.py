@@ -33,7 +33,15 @@ def markdown(results: Json) -> str:
     ):
         if name in results:
             parts += [f"## {title}", maker(results)]
+    if "pace" in results:
+        parts += ["## When, and how fast the machine was", _pace(results)]
     return "\n\n".join(parts) + "\n"
+
+
+def _pace(results: Json) -> str:
+    """When each section was measured, and the machine's speed then as a share of the fastest it was seen."""
+    rows = [[name, results["measured"][name], f"{pace:.2f}"] for name, pace in results["pace"].items()]
+    return table(["section", "measured", "pace"], rows)
 
 
 def splice(page: Path, results: Json) -> None:
