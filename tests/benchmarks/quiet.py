@@ -16,7 +16,7 @@ from tests.benchmarks import rates
 
 Json = dict[str, Any]
 
-ENOUGH = 0.93
+ENOUGH = 0.85
 """A moment is quiet if the machine does this share of the most it was seen to do."""
 
 PAUSE = 10.0
@@ -49,7 +49,7 @@ class Quiet:
     clock: Callable[[], float] = time.perf_counter
 
     def measure(self, section: Callable[[], Json]) -> tuple[Json, float]:
-        """What `section` returned at the quietest moment, and the machine's share of its highest speed then."""
+        """What `section` returned at the quietest moment, and how fast the machine was then."""
         found: list[tuple[float, Json]] = []
         while True:
             before = self._waited()
@@ -59,15 +59,19 @@ class Quiet:
             if len(found) > 1:
                 self.patience -= self.clock() - start
             pace, result = max(found, key=lambda pair: pair[0])
-            if pace >= ENOUGH * self.fastest or self.patience <= 0.0:
-                return result, pace / self.fastest
+            if not self.worth_another(pace):
+                return result, pace
 
     def _waited(self) -> float:
         """The machine's speed, once it is quiet or patience is out."""
-        while (pace := self._look()) < ENOUGH * self.fastest and self.patience > 0.0:
+        while self.worth_another(pace := self._look()):
             self.sleep(PAUSE)
             self.patience -= PAUSE
         return pace
+
+    def worth_another(self, pace: float) -> bool:
+        """Whether a moment at which the machine was so fast was not quiet, and there is patience left."""
+        return pace < ENOUGH * self.fastest and self.patience > 0.0
 
     def _look(self) -> float:
         pace = self.probe()

@@ -40,7 +40,8 @@ def markdown(results: Json) -> str:
 
 def _pace(results: Json) -> str:
     """When each section was measured, and the machine's speed then as a share of the fastest it was seen."""
-    rows = [[name, results["measured"][name], f"{pace:.2f}"] for name, pace in results["pace"].items()]
+    fastest = results["fastest"]
+    rows = [[name, results["measured"][name], f"{pace / fastest:.2f}"] for name, pace in results["pace"].items()]
     return table(["section", "measured", "pace"], rows)
 
 

@@ -43,7 +43,7 @@ def test_what_was_measured_while_it_got_busy_is_measured_again():
 
 
 def test_out_of_patience_the_quietest_counts():
-    machine = Machine(0.9, 0.8, 0.9, 0.6, 0.5)
+    machine = Machine(0.7, 0.8, 0.8, 0.6, 0.5)
     quiet = machine.quiet(patience=2 * PAUSE)
     assert quiet.measure(machine.section) == ({"at": 60.0 + 2 * PAUSE}, 0.6)
     assert quiet.patience <= 0.0
@@ -59,8 +59,9 @@ def test_without_patience_there_is_one_measurement():
 def test_a_machine_faster_than_ever_sets_the_standard():
     machine = Machine(2.0, 1.0, 2.0, 2.0)
     quiet = machine.quiet()
-    assert quiet.measure(machine.section) == ({"at": 120.0}, 1.0)
+    assert quiet.measure(machine.section) == ({"at": 120.0}, 2.0)
     assert quiet.fastest == 2.0
+    assert quiet.worth_another(1.0)
 
 
 def test_the_piece_of_work_takes_time():
