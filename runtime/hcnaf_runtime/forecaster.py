@@ -133,8 +133,9 @@ class Forecaster:
     ) -> Maps:
         """Occupancy maps: the probability of every cell, from the flow's distribution functions.
 
-        In the agent's frame (x forward, y left, origin at the box centre) cells are exact up to `tolerance`: by
-        default TOLERANCE, or a twentieth of `lost_mass` if that is more.
+        In the agent's frame (x forward, y left, origin at the box centre) each cell is exact up to `tolerance`: by
+        default TOLERANCE, or a twentieth of `lost_mass` if that is more; errors of a column's cells
+        add up to nothing.
         In the scene frame the map is computed in the agent's frame with half the cell size, over the box that
         covers the grid, and each fine cell's mass is moved to the scene cell that holds its centre: mass is
         conserved, and displaced by less than half a cell.

@@ -28,10 +28,13 @@ SCOUTS = 8
 COARSE = 8
 """Order of the panels of rows that landmarks are at."""
 
-ORDERS = {4: 1.0, 10: 1.0, 12: 1.0, 20: 10.0}
+ORDERS = {10: 0.1, 12: 0.1, 20: 1.0}
 """Orders of the panels that rows are interpolated from: the first for which landmarks promise an error of less
-than so many times the goal. As a rule they promise ten times too much, and too little where F_2 is rough. The
-least is for columns that hold next to nothing."""
+than so many times the goal. Most keep more than that, but not where F_2 is rough."""
+
+CAUTION = 20.0
+"""Rows that were interpolated are good enough if their coefficients promise an error so many times less than the
+goal: they promise up to ten times too little, and the errors of many cells add up."""
 
 WORTH = 2
 """Rows are interpolated, and judged then, where they are so many times as many as the points or more: where that
@@ -183,7 +186,7 @@ class TileRows:
             j = which[some]
             mass, wrong = self._mass(j, np.broadcast_to(y, (len(j), len(y))))
             off = fall(*between.tails(mass), 1)
-            fine = good[j] = off <= self.goal[j].min(axis=1) / 2.0
+            fine = good[j] = off <= self.goal[j].min(axis=1) / CAUTION
             if fine.any():
                 self._spread(j[fine], between.increments(mass[fine]), wrong[fine], off[fine])
         return good

@@ -140,8 +140,13 @@ def _dense(results: Json) -> str:
             lost = f"{case['lost_mass']:.1e}" if "certified" in kind else ""
             rows.append([name, kind, f"{case[kind]['median'] / maps * 1e3:.3f}", *_times(case[kind]), lost])
     shares = ", ".join(f"{name} {case['occupied']:.0%}" for name, case in results["dense"].items())
+    errors = ", ".join(
+        f"{name} {case['errors']['cell']:.1e} and {case['errors']['map']:.1e}"
+        for name, case in results["dense"].items()
+    )
     note = f"Milliseconds per call. Cells with more than 1e-8: {shares}."
-    return table(["flow", "maps", "per map", *_TIMES, "lost mass"], rows) + f"\n\n{note}"
+    wrong = f"What the worst cell of a dense map is wrong by, and all cells of one taken together: {errors}."
+    return "\n\n".join([table(["flow", "maps", "per map", *_TIMES, "lost mass"], rows), note, wrong])
 
 
 def _ratio(results: Json, case: Json, H: int) -> str:

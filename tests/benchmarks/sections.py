@@ -16,6 +16,7 @@ import torch
 
 from hcnaf_models import flow
 from hcnaf_models.spec import FlowSpec
+from hcnaf_runtime import Condition
 from hcnaf_runtime.bench import LOST_MASS
 from hcnaf_runtime.measure import latency, machine
 from tests.benchmarks import evaluations, libraries, ov, published, rates
@@ -24,7 +25,7 @@ from tests.benchmarks.density import SPREAD, Density, centres, window
 Json = dict[str, Any]
 
 HIDDEN = (20, 100)
-MAPS = 20
+MAPS, EXACT = 20, 3
 
 
 @dataclass(frozen=True)
@@ -104,10 +105,18 @@ def _maps(setting: Setting, density: Density, scale: float) -> Json:
         "maps": MAPS,
         "lost_mass": float(np.max(sparse.lost_mass)),
         "difference": float(np.abs(sparse.mass - full.mass).sum(axis=(2, 3)).max()),
+        "errors": _errors(density, density.condition(EXACT, scale)),
         "window_mass": float(full.window_mass.min()),
         "occupied": float((full.mass[0, 0] > 1e-8).mean()),
         "evaluations": evaluations.per_map(dense, MAPS),
     }
+
+
+def _errors(density: Density, condition: Condition) -> Json:
+    """How far dense maps are from ones refined as far as float32 goes: the worst cell, and all cells of a map."""
+    pom = partial(density.forecaster.pom, condition, window())
+    off = np.abs(pom().mass.astype(np.float64) - pom(tolerance=1e-8).mass)
+    return {"cell": float(off.max()), "map": float(off.sum(axis=(2, 3)).max())}
 
 
 def measure_published(setting: Setting) -> Json:
