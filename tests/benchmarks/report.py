@@ -143,6 +143,7 @@ def _dense(results: Json) -> str:
     errors = ", ".join(
         f"{name} {case['errors']['cell']:.1e} and {case['errors']['map']:.1e}"
         for name, case in results["dense"].items()
+        if "errors" in case  # not in records made before it was measured
     )
     note = f"Milliseconds per call. Cells with more than 1e-8: {shares}."
     wrong = f"What the worst cell of a dense map is wrong by, and all cells of one taken together: {errors}."
