@@ -26,6 +26,7 @@ Json = dict[str, Any]
 
 HIDDEN = (20, 100)
 MAPS, EXACT = 20, 3
+"""Maps per call, and how many are compared with ones as exact as can be."""
 
 
 @dataclass(frozen=True)
